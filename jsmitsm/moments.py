@@ -1,0 +1,373 @@
+"""One particle's moment system: its row of the global system, and its Taylor coefficients.
+
+Written once for one particle and vmapped by ``assembly``. All polynomials are in the offset
+s = (x_g - x_i) / l, scaled by a length l of the support, so nothing here knows of units.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jsmitsm.kernels import EDGE, Kernel
+from jsmitsm.recursion import Recursion, Slot, constraints, general_inverse, null_space, substitution
+from jsmitsm.taylor import factorial, index_of, multi_indices
+
+
+@dataclass(frozen=True)
+class Scheme:
+    """What is static about a class of particles: the method and the shapes of its systems.
+
+    Attributes
+    ----------
+    free, dependent : positions of the paper's free and dependent coefficients (I, II, III).
+    own : slots of the particle's own boundary conditions, and their number.
+    data : slots of the conditions that neighbours contribute as data, and their number.
+    """
+
+    method: str
+    rec: Recursion
+    free: tuple[int, ...] = ()
+    dependent: tuple[int, ...] = ()
+    own: tuple[Slot, ...] = ()
+    n_own: int = 0
+    data: tuple[Slot, ...] = ()
+    n_data: int = 0
+
+
+class Elimination(NamedTuple):
+    """U = Q F + B c: the local solutions, and the lengths by which the constraints were divided."""
+
+    basis: Any  # (F K, free)
+    particular: Any  # (F K, rows)
+    lift: Any  # (rows,)
+    rows: Any  # (F, F K): the equations themselves, needed by collocation
+
+
+class Row(NamedTuple):
+    """A particle's equations: own u_i - sum_g weights u_g = source . F + condition . g.
+
+    The first axis runs over the F equations of the particle.
+    """
+
+    weights: Any  # (F, ns, F)
+    data: Any  # (F, ns, n_data)
+    source: Any  # (F, rows)
+    condition: Any  # (F, n_own)
+    lebesgue: Any  # (F,)
+    defect: Any  # (), how far the moment system is from determining what was asked
+
+
+class Support(NamedTuple):
+    """A particle's neighbours: scaled offsets, their distances and kernel weights."""
+
+    offset: Any  # (ns, D), scaled by length
+    weight: Any  # (ns,)
+    inside: Any  # (ns,) bool
+    length: Any  # ()
+
+
+def support(points: Any, i: Any, neighbours: Any, kernel: Kernel | None) -> Support:
+    """Offsets and weights of one particle's neighbours.
+
+    Without a kernel the weight is exp(-(2 r / r_max)^2), r_max the distance of the farthest.
+    """
+    valid = neighbours >= 0
+    offset = points[jnp.where(valid, neighbours, i)] - points[i]
+    square = jnp.sum(offset**2, axis=1)
+    apart = square > 0
+    distance = jnp.where(apart, jnp.sqrt(jnp.where(apart, square, 1.0)), 0.0)
+    if kernel is None:
+        length = jnp.max(distance)
+        weight, inside = jnp.exp(-4.0 * square / length**2), valid
+    else:
+        own = kernel.at(i)
+        inside = valid & (distance <= own.d * own.h * EDGE)
+        length = own.h * jnp.minimum(own.d, 2.0)
+        weight = jnp.maximum(own.profile(distance / own.h), 0.0)
+    return Support(offset / length, jnp.where(inside, weight, 0.0), inside, length)
+
+
+# ------------------------------------------------------------ polynomials
+
+
+@lru_cache(maxsize=32)
+def _monomial_steps(dim: int, order: int) -> list[tuple[int, int, int]]:
+    """Blocks (source prefix, axis, how many) that build each degree from the one before."""
+    indices, place = multi_indices(dim, order), index_of(dim, order)
+    steps = []
+    for k, a in enumerate(indices[1:], start=1):
+        axis = next(j for j in range(dim) if a[j])
+        lower = tuple(v - (j == axis) for j, v in enumerate(a))
+        steps.append((k, place[lower], axis))
+    return steps
+
+
+def monomials(offset: Any, order: int) -> Any:
+    """All monomials s^a with |a| <= order: (ns, D) -> (ns, K)."""
+    columns = [jnp.ones_like(offset[:, 0])]
+    for _, lower, axis in _monomial_steps(offset.shape[1], order):
+        columns.append(columns[lower] * offset[:, axis])
+    return jnp.stack(columns, axis=1)
+
+
+@lru_cache(maxsize=256)
+def derivative_table(dim: int, order: int, b: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """d^b s^a = factor[a] s^(a-b): the place of a - b (0 where the factor is 0), and the factor."""
+    place = index_of(dim, order)
+    lower = [tuple(ai - bi for ai, bi in zip(a, b)) for a in place]
+    ok = [min(c) >= 0 for c in lower]
+    return (
+        np.array([place[c] if good else 0 for c, good in zip(lower, ok)]),
+        np.array([factorial(a) / factorial(c) if good else 0.0 for a, c, good in zip(place, lower, ok)]),
+    )
+
+
+def functionals(slots: Sequence[Slot], coef: Any, p: Any, rec: Recursion, length: Any) -> tuple[Any, Any]:
+    """Rows (n, F K) of conditions sum_s coef[n, s] d^b u_f at a point with monomials p (K,).
+
+    Each row is scaled to be free of units and of unit size at the leading term; the second
+    result holds the factors (n,) of the right-hand side.
+    """
+    rows = jnp.zeros((coef.shape[0], rec.fields * rec.size), p.dtype)
+    for s, (f, b) in enumerate(slots):
+        lower, factor = derivative_table(rec.dim, rec.order, b)
+        row = p[lower] * factor * length ** (-sum(b) - rec.weights[f])
+        rows = rows.at[:, f * rec.size : (f + 1) * rec.size].add(coef[:, s, None] * row)
+    sizes = jnp.stack([jnp.abs(coef[:, s]) * length ** (-sum(b) - rec.weights[f]) for s, (f, b) in enumerate(slots)])
+    size = jnp.max(sizes, axis=0)
+    scale = 1.0 / jnp.where(size > 0, size, 1.0)
+    return rows * scale[:, None], scale
+
+
+@lru_cache(maxsize=32)
+def whitening(dim: int, order: int) -> np.ndarray:
+    """A triangular T (K, K): the polynomials s^a T are orthonormal over the unit ball under the
+    default weight, so that normal equations of the moment systems are safe."""
+    nodes, weights = np.polynomial.legendre.leggauss(order + 12)
+    grid = np.stack(np.meshgrid(*[nodes] * dim, indexing="ij"), axis=-1).reshape(-1, dim)
+    mass = np.prod(np.stack(np.meshgrid(*[weights] * dim, indexing="ij"), axis=-1).reshape(-1, dim), axis=1)
+    inside = (grid**2).sum(axis=1) <= 1
+    grid, mass = grid[inside], mass[inside]
+    root = np.sqrt(mass / mass.sum() * np.exp(-4 * (grid**2).sum(axis=1)))
+    p = np.stack([np.prod(grid ** np.array(a), axis=1) for a in multi_indices(dim, order)], axis=1)
+    r = np.linalg.qr(root[:, None] * p, mode="r")
+    return np.linalg.inv(r * np.sign(np.diag(r))[:, None])
+
+
+# ------------------------------------------------------------ small systems
+
+
+def gram_inverse(a: Any, tolerance: float | None = None) -> Any:
+    """(A^T A)^-1 for a tall A (n, k) by symmetric sweeps; with a tolerance, columns that depend
+    on others up to it are left out (zero rows and columns)."""
+    size = jnp.sqrt(jnp.sum(a**2, axis=0))
+    scale = 1.0 / jnp.where(size > 0, size, 1.0)
+    gram = (a * scale).T @ (a * scale)
+    k = gram.shape[0]
+
+    def sweep(g, j, keep):
+        row = g[j]
+        pivot = jnp.where(keep, row[j], 1.0)
+        swept = g - jnp.outer(row, row / pivot)
+        swept = swept.at[j].set(row / pivot).at[:, j].set(row / pivot).at[j, j].set(-1.0 / pivot)
+        return jnp.where(keep, swept, g)
+
+    if tolerance is None:
+        inverse = -jax.lax.fori_loop(0, k, lambda j, g: sweep(g, j, True), gram)
+    else:
+
+        def pivoted(_, carry):
+            g, done = carry
+            rest = jnp.where(done, -1.0, jnp.diagonal(g))
+            j = jnp.argmax(rest)
+            keep = rest[j] > tolerance
+            return sweep(g, j, keep), done.at[j].set(done[j] | keep)
+
+        g, done = jax.lax.fori_loop(0, k, pivoted, (gram, jnp.zeros(k, bool)))
+        inverse = jnp.where(done[:, None] & done[None, :], -g, 0.0)
+    return inverse * scale[:, None] * scale[None, :]
+
+
+def min_norm(a: Any, t: Any, tolerance: float | None = None) -> Any:
+    """The smallest w (n, m) with A^T w = t, for A (n, k) and t (k, m); refined once."""
+    return _min_norm(tolerance, a, t)[0]
+
+
+def _solve_gram(a: Any, inverse: Any, t: Any) -> Any:
+    y = inverse @ t
+    return y + inverse @ (t - a.T @ (a @ y))
+
+
+def _min_norm_impl(tolerance, a, t):
+    inverse = gram_inverse(a, tolerance)
+    y = _solve_gram(a, inverse, t)
+    return a @ y, y
+
+
+_min_norm = jax.custom_jvp(_min_norm_impl, nondiff_argnums=(0,))
+
+
+@_min_norm.defjvp
+def _min_norm_jvp(tolerance, primals, tangents):
+    # w = A y and A^T w = t, so dw = dA y + A dy with A^T A dy = dt - dA^T w - A^T dA y.
+    (a, t), (da, dt) = primals, tangents
+    w, y = _min_norm(tolerance, a, t)
+    day = da @ y
+    dy = _solve_gram(a, gram_inverse(a, tolerance), dt - da.T @ w - a.T @ day)
+    return (w, y), (day + a @ dy, dy)
+
+
+# ------------------------------------------------------------ the methods
+
+
+def _blocks(matrix: Any, fields: int) -> Any:
+    """The whitening applied to each field's block of columns."""
+    return matrix if fields == 1 else jnp.kron(jnp.eye(fields), matrix)
+
+
+def eliminate(scheme: Scheme, jac: Any, length: Any) -> Elimination:
+    """Solve the recursion of one particle for its free coefficients.
+
+    jac (E, S, T). Method S and SSPH use polynomials that are orthonormal over the support.
+    """
+    rec = scheme.rec
+    matrix, lift = constraints(rec, jac, length)
+    rows = matrix[np.array(rec.equation_rows)]
+    if scheme.method == "SSPH":
+        white = _blocks(jnp.asarray(whitening(rec.dim, rec.order)), rec.fields)
+        return Elimination(white, jnp.zeros((white.shape[0], matrix.shape[0])), lift, rows)
+    if scheme.method == "S":
+        white = _blocks(jnp.asarray(whitening(rec.dim, rec.order)), rec.fields)
+        z, q = null_space(matrix @ white)
+        return Elimination(white @ z, white @ q, lift, rows)
+    order = np.concatenate([scheme.free, np.setdiff1d(_all_free(scheme), scheme.free)]).astype(int)
+    z, q = substitution(matrix, order, np.array(scheme.dependent))
+    return Elimination(z[:, : len(scheme.free)], q, lift, rows)
+
+
+def _all_free(scheme: Scheme) -> np.ndarray:
+    return np.setdiff1d(np.arange(scheme.rec.size), scheme.dependent)
+
+
+def _fit(scheme: Scheme, near: Support, phi: Any, tests: Any, target: Any) -> Any:
+    """Weights w (n, m) on the data with phi^T w = target, in the method's test space."""
+    if tests is None:
+        root = jnp.sqrt(near)[:, None]
+        tolerance = 1e-13 if scheme.method == "SSPH" else None
+        return root * min_norm(root * phi, target, tolerance)
+    return tests @ (general_inverse(phi.T @ tests) @ target)
+
+
+class System(NamedTuple):
+    """One particle's local fit before a functional of it is asked for."""
+
+    elimination: Elimination
+    reduced: Any  # (F K, free after the own conditions)
+    own_rows: Any  # (n_own, F K)
+    own_scale: Any  # (n_own,)
+    own_solve: Any  # (free, n_own)
+    values: Any  # (rows of data, F K): the data as functionals of U
+    phi: Any  # values @ reduced
+    weight: Any  # (rows of data,)
+    tests: Any  # (rows of data, free) or None
+    data_scale: Any  # (ns, n_data)
+
+
+def local_system(
+    scheme: Scheme, near: Support, solution: Elimination, own: Any, data: Any, derivatives: Any, skip_self: bool
+) -> System:
+    """Set up the moment system of one particle.
+
+    own (n_own, S_own): coefficients of its own conditions, imposed exactly; data
+    (ns, n_data, S_data): coefficients of its neighbours' conditions, fitted like values;
+    derivatives (ns, free): kernel derivatives for the tests of III.
+    """
+    rec = scheme.rec
+    p = monomials(near.offset, rec.order)
+    ns, fields = p.shape[0], rec.fields
+    weight = near.weight.at[0].set(0.0) if skip_self else near.weight
+    values = jnp.einsum("gk,fh->gfhk", p, jnp.eye(fields)).reshape(ns * fields, -1) if fields > 1 else p
+    weights = jnp.repeat(weight, fields)
+    data_scale = jnp.zeros((ns, 0))
+    if scheme.n_data:
+        rows, data_scale = jax.vmap(lambda c, q: functionals(scheme.data, c, q, rec, near.length))(data, p)
+        given = jnp.any(data != 0, axis=2)
+        values = jnp.concatenate([values, rows.reshape(ns * scheme.n_data, -1)])
+        weights = jnp.concatenate([weights, (given * weight[:, None]).reshape(-1)])
+    basis = solution.basis
+    own_rows, own_scale = jnp.zeros((0, basis.shape[0])), jnp.zeros(0)
+    own_solve = jnp.zeros((basis.shape[1], 0))
+    if scheme.n_own and scheme.method != "SSPH":
+        at = jnp.zeros(rec.size, p.dtype).at[0].set(1.0)
+        own_rows, own_scale = functionals(scheme.own, own, at, rec, near.length)
+        z, own_solve = null_space(own_rows @ basis)
+        basis = basis @ z
+        derivatives = None if derivatives is None else derivatives @ z
+    phi = values @ basis
+    return System(
+        solution, basis, own_rows, own_scale, own_solve, values, phi, weights, derivatives, data_scale
+    )
+
+
+def functional(scheme: Scheme, near: Support, system: System, wanted: Any) -> tuple[Any, Any, Any, Any]:
+    """Weights of the data, the source and the own conditions in ``wanted`` (m, F K) . U.
+
+    Returns w (rows of data, m), v (rows, m), v_own (n_own, m) and the defect of the system.
+    """
+    target = system.reduced.T @ wanted.T
+    w = _fit(scheme, system.weight, system.phi, system.tests, target)
+    size = jnp.max(jnp.abs(target))
+    defect = jnp.max(jnp.abs(system.phi.T @ w - target)) / jnp.where(size > 0, size, 1.0)
+    rest = wanted.T - system.values.T @ w
+    v_own = system.own_solve.T @ (system.elimination.basis.T @ rest)
+    v = system.elimination.particular.T @ (rest - system.own_rows.T @ v_own)
+    return w, v, v_own, defect
+
+
+def row(scheme: Scheme, near: Support, solution: Elimination, own: Any, data: Any, derivatives: Any) -> Row:
+    """The particle's equations in the global system."""
+    make = _collocated if scheme.method == "SSPH" else _predicted
+    w, v, v_own, lebesgue, defect, system = make(scheme, near, solution, own, data, derivatives)
+    rec, ns = scheme.rec, near.weight.shape[0]
+    fields = rec.fields
+    # Fields are balanced by powers of the length inside the fit; the global unknowns are not.
+    power = near.length ** jnp.asarray(rec.weights, near.length.dtype)
+    lift = jnp.ones(fields) if scheme.method == "SSPH" else 1.0 / power
+    values = w[: ns * fields].T.reshape(fields, ns, fields) * power * lift[:, None, None]
+    extra = w[ns * fields :].T.reshape(fields, ns, scheme.n_data) * system.data_scale * lift[:, None, None]
+    return Row(values, extra, v.T * lift[:, None], v_own.T * lift[:, None], lebesgue, defect)
+
+
+def _predicted(scheme, near, solution, own, data, derivatives):
+    """u_i = U_i(0): the particle's value as its neighbours predict it."""
+    rec = scheme.rec
+    system = local_system(scheme, near, solution, own, data, derivatives, skip_self=True)
+    wanted = np.zeros((rec.fields, rec.fields * rec.size))
+    wanted[np.arange(rec.fields), np.arange(rec.fields) * rec.size] = 1.0
+    w, v, v_own, defect = functional(scheme, near, system, jnp.asarray(wanted))
+    lebesgue = jnp.sum(jnp.abs(w), axis=0)
+    return w, v * solution.lift[:, None], v_own * system.own_scale[:, None], lebesgue, defect, system
+
+
+def _collocated(scheme, near, solution, own, data, derivatives):
+    """The equation itself, or the particle's own boundary condition, applied to the fit (SSPH)."""
+    rec = scheme.rec
+    system = local_system(scheme, near, solution, own, data, derivatives, skip_self=False)
+    at = np.array(rec.equation_rows)
+    wanted, v = solution.rows, jnp.zeros((rec.n_rows, rec.fields)).at[at, np.arange(rec.fields)].set(solution.lift[at])
+    v_own = jnp.zeros((0, rec.fields))
+    if scheme.n_own:
+        here = jnp.zeros(rec.size).at[0].set(1.0)
+        wanted, scale = functionals(scheme.own, own, here, rec, near.length)
+        v, v_own = jnp.zeros_like(v), jnp.diag(scale)
+    w, _, _, defect = functional(scheme, near, system, wanted)
+    own_weight = jnp.abs(w[np.arange(rec.fields), np.arange(rec.fields)])
+    others = jnp.sum(jnp.abs(w), axis=0) - own_weight
+    return -w, v, v_own, others / jnp.where(own_weight > 0, own_weight, 1.0), defect, system

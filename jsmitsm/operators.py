@@ -1,0 +1,431 @@
+"""The local field a PDE sees, and the differential operators acting on it."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching
+
+from jsmitsm.taylor import MultiIndex, add
+
+Slot = tuple[int, MultiIndex]
+
+# d^a u_k at a point.  Its derivative is the next higher derivative, which is all that
+# jax.grad, jax.jacfwd and the operators below need to know about an unknown field.
+field_p = Primitive("field")
+# Marks a factor that an operator treated as constant: it must not depend on the point.
+frozen_p = Primitive("frozen")
+
+
+def _unit(dim: int, axis: int) -> MultiIndex:
+    return tuple(int(i == axis) for i in range(dim))
+
+
+@field_p.def_impl
+def _field_impl(point: Any, *, field: int, index: MultiIndex) -> Any:
+    raise ValueError(
+        "the field u has no value here: it can be evaluated only inside a pde or a boundary condition, "
+        "at the point x they receive"
+    )
+
+
+@field_p.def_abstract_eval
+def _field_abstract(point: Any, *, field: int, index: MultiIndex) -> Any:
+    return jax.core.ShapedArray((), point.dtype)
+
+
+def _field_jvp(primals: Any, tangents: Any, *, field: int, index: MultiIndex) -> tuple[Any, Any]:
+    (point,), (dx,) = primals, tangents
+    out = field_p.bind(point, field=field, index=index)
+    if isinstance(dx, ad.Zero):
+        return out, ad.Zero(jax.typeof(out).to_tangent_aval())
+    dim = len(index)
+    higher = [add(index, _unit(dim, i)) for i in range(dim)]
+    if isinstance(dx, jax.core.Tracer):
+        slopes = [field_p.bind(point, field=field, index=b) for b in higher]
+        return out, jax.lax.dot(_stack(slopes), dx)
+    # A known direction asks only for the derivatives it needs.
+    parts = [
+        field_p.bind(point, field=field, index=b) * c if c != 1 else field_p.bind(point, field=field, index=b)
+        for b, c in zip(higher, np.asarray(dx), strict=True)
+        if c != 0
+    ]
+    return out, sum(parts[1:], parts[0]) if parts else ad.Zero(jax.typeof(out).to_tangent_aval())
+
+
+def _field_batch(args: Any, axes: Any, *, field: int, index: MultiIndex) -> Any:
+    raise ValueError(
+        "the field u was evaluated at a batch of points (jax.vmap): a pde sees u only at its own point x; "
+        "write the residual for one point, the package maps it over the particles"
+    )
+
+
+ad.primitive_jvps[field_p] = _field_jvp
+batching.primitive_batchers[field_p] = _field_batch
+
+frozen_p.def_impl(lambda value: value)
+frozen_p.def_abstract_eval(lambda value: value)
+ad.deflinear2(frozen_p, lambda cotangent, _: [cotangent])
+batching.defvectorized(frozen_p)
+
+
+def _stack(scalars: Any) -> jax.Array:
+    """Scalars to a vector, in the fewest traced operations."""
+    if len(scalars) == 1:
+        return jax.lax.broadcast(scalars[0], (1,))
+    return jax.lax.concatenate([jax.lax.broadcast(s, (1,)) for s in scalars], 0)
+
+
+def _is_scalar(value: Any) -> bool:
+    return isinstance(value, int | float | np.number | np.ndarray | jax.Array) and np.ndim(value) == 0
+
+
+def _needs_point(other: Any) -> TypeError:
+    return TypeError(
+        f"a field or a derivative of it was combined with {type(other).__name__}; "
+        "evaluate it at the point first, as in js.laplacian(u)(x) + f(x)"
+    )
+
+
+class Field:
+    """A scalar function of the point: a linear combination of derivatives of the unknown fields.
+
+    Sums of fields and multiples by a scalar independent of the point are fields again, so
+    composed operators are exact algebra on the derivatives.  ``u(x)`` gives a scalar.
+    Raises ``ValueError`` for a point that is not of shape (D,).
+
+    >>> import jsmitsm as js
+    >>> js.Problem(lambda u, x: js.laplacian(u)(x) - u(x), {"left": js.dirichlet(0.0)})  # doctest: +SKIP
+    """
+
+    __slots__ = ("dim", "terms")
+    __array_ufunc__ = None  # numpy scalars defer to __rmul__
+    ndim = 0
+    shape = ()
+
+    def __init__(self, dim: int, terms: dict[Slot, Any]):
+        self.dim, self.terms = dim, terms
+
+    def __call__(self, x: Any) -> Any:
+        x = jnp.asarray(x)
+        if x.shape != (self.dim,):
+            raise ValueError(
+                f"a field takes one point of shape ({self.dim},), got shape {x.shape}; pass the x that the pde receives"
+            )
+        total = None
+        for (k, index), c in self.terms.items():
+            value = field_p.bind(x, field=k, index=index)
+            value = value if _is_one(c) else c * value
+            total = value if total is None else total + value
+        return jnp.zeros((), x.dtype) if total is None else total
+
+    def _shifted(self, index: MultiIndex) -> Field:
+        """The derivative d^index of this field."""
+        if len(index) != self.dim or any(k < 0 for k in index):
+            raise ValueError(f"multi_index must be {self.dim} non-negative integers, got {index}")
+        return Field(self.dim, {(k, add(a, index)): _frozen(c) for (k, a), c in self.terms.items()})
+
+    def __add__(self, other: Any) -> Field:
+        if not isinstance(other, Field):
+            if _is_scalar(other) and not isinstance(other, jax.core.Tracer) and other == 0:
+                return self  # sum() starts from 0
+            raise _needs_point(other)
+        terms = dict(self.terms)
+        for slot, c in other.terms.items():
+            c = terms[slot] + c if slot in terms else c
+            terms[slot] = c
+            if not isinstance(c, jax.core.Tracer) and c == 0:
+                del terms[slot]
+        return Field(self.dim, terms)
+
+    __radd__ = __add__
+
+    def __mul__(self, factor: Any) -> Field:
+        if not _is_scalar(factor):
+            raise _needs_point(factor)
+        if not isinstance(factor, jax.core.Tracer) and factor == 0:
+            return Field(self.dim, {})
+        return Field(self.dim, {slot: factor if _is_one(c) else c * factor for slot, c in self.terms.items()})
+
+    __rmul__ = __mul__
+
+    def __truediv__(self, factor: Any) -> Field:
+        if not _is_scalar(factor):
+            raise _needs_point(factor)
+        return self * (1.0 / factor)
+
+    def __neg__(self) -> Field:
+        return -1.0 * self
+
+    def __sub__(self, other: Any) -> Field:
+        if not isinstance(other, Field):
+            raise _needs_point(other)
+        return self + (-other)
+
+    def __rsub__(self, other: Any) -> Field:
+        return -self + other
+
+
+def _is_one(c: Any) -> bool:
+    return not isinstance(c, jax.core.Tracer) and bool(c == 1)
+
+
+def _frozen(c: Any) -> Any:
+    return frozen_p.bind(c) if isinstance(c, jax.core.Tracer) else c
+
+
+class LocalField:
+    """An array of scalar fields: the unknowns of a system, a gradient, a Hessian.
+
+    ``u(x)`` is an array of ``u.shape``; ``u[k]`` a scalar field (or a smaller array of them).
+    """
+
+    __slots__ = ("dim", "entries")
+    __array_ufunc__ = None
+
+    def __init__(self, dim: int, entries: Any):
+        self.dim = dim
+        self.entries = _object_array(entries)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return self.entries.shape
+
+    @property
+    def ndim(self) -> int:
+        return self.entries.ndim
+
+    def __len__(self) -> int:
+        return len(self.entries)
+
+    def __getitem__(self, key: Any) -> Any:
+        part = self.entries[key]
+        return part if isinstance(part, Field) else LocalField(self.dim, part)
+
+    def __iter__(self) -> Iterator[Any]:
+        return (self[k] for k in range(len(self)))
+
+    def __call__(self, x: Any) -> jax.Array:
+        values = _stack([f(x) for f in self.entries.ravel()])
+        return values if self.ndim == 1 else values.reshape(self.shape)
+
+    def _map(self, function: Callable[[Field], Any]) -> LocalField:
+        """Apply an operator to every entry; its own axes come last."""
+        parts = [function(f) for f in self.entries.ravel()]
+        inner = parts[0].shape
+        flat = [f for p in parts for f in (p.entries.ravel() if inner else [p])]
+        return LocalField(self.dim, _object_array(flat).reshape(self.shape + inner))
+
+    def __add__(self, other: Any) -> LocalField:
+        if _is_scalar(other) and not isinstance(other, jax.core.Tracer) and other == 0:
+            return self
+        if not isinstance(other, LocalField) or other.shape != self.shape:
+            raise _needs_point(other)
+        pairs = zip(self.entries.ravel(), other.entries.ravel(), strict=True)
+        return LocalField(self.dim, _object_array([a + b for a, b in pairs]).reshape(self.shape))
+
+    __radd__ = __add__
+
+    def __mul__(self, factor: Any) -> LocalField:
+        return self._map(lambda f: f * factor)
+
+    __rmul__ = __mul__
+
+    def __truediv__(self, factor: Any) -> LocalField:
+        return self._map(lambda f: f / factor)
+
+    def __neg__(self) -> LocalField:
+        return self * -1.0
+
+    def __sub__(self, other: Any) -> LocalField:
+        if not isinstance(other, LocalField):
+            raise _needs_point(other)
+        return self + (-other)
+
+
+def _object_array(entries: Any) -> np.ndarray:
+    if isinstance(entries, np.ndarray):
+        return entries
+    out = np.empty(len(entries), object)
+    out[:] = entries
+    return out
+
+
+def local_field(dim: int, fields: int = 1) -> Field | LocalField:
+    """The unknown of a problem: one scalar field, or an array of several."""
+    zero = (0,) * dim
+    each = [Field(dim, {(k, zero): 1.0}) for k in range(fields)]
+    return each[0] if fields == 1 else LocalField(dim, each)
+
+
+def partial(u: Any, multi_index: MultiIndex | int) -> Any:
+    """The derivative d^a u, a function of the point.
+
+    Parameters: ``u``, a field or any function of a point (D,); ``multi_index``, D
+    non-negative integers, the order along each axis (in 1D an integer will do).
+    Raises ``ValueError`` if its length is not D.
+
+    >>> import jax.numpy as jnp
+    >>> float(partial(lambda y: y[0] ** 2 * y[1], (1, 1))(jnp.array([3.0, 5.0])))
+    6.0
+    """
+    index = (multi_index,) if isinstance(multi_index, int) else tuple(int(k) for k in multi_index)
+    if isinstance(u, Field):
+        return u._shifted(index)
+    if isinstance(u, LocalField):
+        return u._map(lambda f: f._shifted(index))
+
+    def derivative(x: Any) -> Any:
+        x = _point(x)
+        if len(index) != len(x) or any(k < 0 for k in index):
+            raise ValueError(f"multi_index must be {len(x)} non-negative integers, got {index}")
+        function = _array_valued(u)
+        for axis, times in enumerate(index):
+            for _ in range(times):
+                function = _along(function, axis)
+        return function(x)
+
+    return derivative
+
+
+def grad(u: Any) -> Any:
+    """The gradient of ``u``, a function of the point; derivatives on the last axis.
+
+    ``grad(u)(x)`` is (D,) for a scalar ``u``, (F, D) for a vector.  ``u`` is a field or any
+    function of a point (D,).
+
+    >>> import jax.numpy as jnp
+    >>> grad(lambda y: y[0] * y[1])(jnp.array([3.0, 5.0])).tolist()
+    [5.0, 3.0]
+    """
+    if isinstance(u, Field):
+        return LocalField(u.dim, [u._shifted(_unit(u.dim, i)) for i in range(u.dim)])
+    if isinstance(u, LocalField):
+        return u._map(grad)
+    function = _array_valued(u)
+    return lambda x: jnp.stack([_along(function, i)(_point(x)) for i in range(len(_point(x)))], -1)
+
+
+def hessian(u: Any) -> Any:
+    """The second derivatives of ``u``, a function of the point: (D, D), or (F, D, D).
+
+    >>> import jax.numpy as jnp
+    >>> hessian(lambda y: y[0] ** 2 * y[1])(jnp.array([3.0, 5.0])).tolist()
+    [[10.0, 6.0], [6.0, 0.0]]
+    """
+    if isinstance(u, Field | LocalField):
+        return grad(grad(u))
+    function = _array_valued(u)
+
+    def matrix(x: Any) -> jax.Array:
+        x = _point(x)
+        dim = len(x)
+        upper = {
+            (i, j): _along(_along(function, i), j)(x) for i, j in itertools.combinations_with_replacement(range(dim), 2)
+        }
+        rows = [jnp.stack([upper[min(i, j), max(i, j)] for j in range(dim)], -1) for i in range(dim)]
+        return jnp.stack(rows, -2)
+
+    return matrix
+
+
+def laplacian(u: Any) -> Any:
+    """The sum of the second derivatives of ``u``, a function of the point: a scalar, or (F,).
+
+    >>> import jax.numpy as jnp
+    >>> float(laplacian(lambda y: y[0] ** 2 * y[1])(jnp.array([3.0, 5.0])))
+    10.0
+    """
+    if isinstance(u, Field):
+        total = Field(u.dim, {})
+        for i in range(u.dim):
+            total = total + u._shifted(tuple(2 * k for k in _unit(u.dim, i)))
+        return total
+    if isinstance(u, LocalField):
+        return u._map(laplacian)
+    function = _array_valued(u)
+    return lambda x: sum(_along(_along(function, i), i)(_point(x)) for i in range(len(_point(x))))
+
+
+def divergence(v: Any) -> Any:
+    """The divergence of ``v``, a function of the point, summed over the last axis.
+
+    ``v(x)`` is (D,) (the result a scalar) or (F, D) (row by row: F values).  Raises
+    ``ValueError`` if the last axis is not of length D.
+
+    >>> import jax.numpy as jnp
+    >>> float(divergence(lambda y: y ** 2)(jnp.array([3.0, 5.0])))
+    16.0
+    """
+    if isinstance(v, Field):
+        raise ValueError("v must be a vector field with D components, got a scalar field; did you mean grad(u)?")
+    if isinstance(v, LocalField):
+        _check_last_axis(v.shape, v.dim)
+        total = v[..., 0]._shifted(_unit(v.dim, 0)) if v.ndim == 1 else partial(v[..., 0], _unit(v.dim, 0))
+        for i in range(1, v.dim):
+            total = total + partial(v[..., i], _unit(v.dim, i))
+        return total
+    function = _array_valued(v)
+
+    def total_slope(x: Any) -> Any:
+        x = _point(x)
+        dim = len(x)
+
+        def component(i: int) -> Callable[[Any], Any]:
+            def part(y: Any) -> Any:
+                value = function(y)
+                _check_last_axis(value.shape, dim)
+                return value[..., i]
+
+            return part
+
+        return sum(_along(component(i), i)(x) for i in range(dim))
+
+    return total_slope
+
+
+def _check_last_axis(shape: tuple[int, ...], dim: int) -> None:
+    if not shape or shape[-1] != dim:
+        raise ValueError(
+            f"v must give {dim} components on its last axis, one per dimension of the point, got shape {tuple(shape)}"
+        )
+
+
+def _point(x: Any) -> jax.Array:
+    x = jnp.asarray(x)
+    if x.ndim != 1:
+        raise ValueError(f"x must be one point of shape (D,), got shape {x.shape}")
+    return x
+
+
+def _array_valued(function: Any) -> Callable[[Any], Any]:
+    if not callable(function):
+        raise ValueError(
+            f"an operator takes a field or a function of the point, got {type(function).__name__}; "
+            "write js.grad(u)(x), not js.grad(u(x))"
+        )
+
+    def value(y: Any) -> Any:
+        out = function(y)
+        if isinstance(out, Field | LocalField):
+            raise ValueError("the function returned a field instead of its value: evaluate it, as in js.grad(u)(y)")
+        return jnp.stack(out) if isinstance(out, list | tuple) else jnp.asarray(out)
+
+    return value
+
+
+def _along(function: Callable[[Any], Any], axis: int) -> Callable[[Any], Any]:
+    """The derivative of a function of the point along one axis, by forward mode."""
+
+    def slope(y: Any) -> Any:
+        direction = np.zeros(len(y), y.dtype)
+        direction[axis] = 1
+        return jax.jvp(function, (y,), (direction,))[1]
+
+    return slope

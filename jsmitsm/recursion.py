@@ -1,0 +1,276 @@
+"""The differential transform of a PDE: its Taylor coefficients as linear constraints.
+
+For a linear operator ``sum_b a_b(x) d^b u = f(x)`` every Taylor coefficient of the residual
+about a particle vanishes up to degree p - m (Karamanli 2015, eqs. 32, 37, 40):
+
+    sum_b sum_{t<=c} A_b(t) (c-t+b)!/(c-t)! U(c-t+b) = F(c),      |c| <= p - m
+
+with A_b, F the coefficients of a_b and f and U(a) = d^a u / a!. In coordinates scaled by a
+length l, the unknowns are l^|a| U(a), and the row c carries the factor l^(m+|c|), so that all
+entries are free of units. The solutions of these constraints are
+
+    U = Q F + Z c
+
+with Z a basis of the homogeneous local solutions and c the free coefficients.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jsmitsm.taylor import factorial, index_of, multi_indices
+
+Slot = tuple[int, tuple[int, ...]]
+
+
+@dataclass(frozen=True)
+class Recursion:
+    """The static structure of the constraints; built once per problem and order.
+
+    Attributes
+    ----------
+    levels : per equation, the power of length that makes its leading terms free of units.
+    weights : per field, the power of length that balances it against the others
+        (a pressure counts one derivative less than a velocity).
+    degrees : per equation, the highest degree of residual coefficients that is set to zero.
+    """
+
+    dim: int
+    order: int
+    fields: int
+    slots: tuple[Slot, ...]
+    levels: tuple[int, ...]
+    weights: tuple[int, ...]
+    degrees: tuple[int, ...]
+    pattern: tuple[tuple[bool, ...], ...]
+
+    @property
+    def size(self) -> int:
+        """Taylor coefficients of one field, K."""
+        return len(multi_indices(self.dim, self.order))
+
+    @property
+    def degree(self) -> int:
+        """The highest degree to which Taylor coefficients of the operator are needed."""
+        return max(self.degrees)
+
+    @property
+    def n_rows(self) -> int:
+        return len(_rows(self))
+
+    @property
+    def scale_free(self) -> bool:
+        """Whether constant coefficients give the same constraints at every length scale."""
+        return all(
+            self.levels[e] == sum(b) + self.weights[f]
+            for e in range(len(self.levels))
+            for s, (f, b) in enumerate(self.slots)
+            if self.pattern[e][s]
+        )
+
+    @property
+    def equation_rows(self) -> tuple[int, ...]:
+        """The row of each equation's residual itself (c = 0)."""
+        return tuple(k for k, (_, c) in enumerate(_rows(self)) if sum(c) == 0)
+
+
+def recursion(
+    dim: int, order: int, fields: int, slots: Sequence[Slot], pattern: np.ndarray, orders: Sequence[int]
+) -> Recursion:
+    """Lay out the constraints of a traced operator for Taylor expansions of degree ``order``."""
+    weights = [0] * fields
+    for f in range(fields):
+        gaps = [
+            orders[e] - max(sum(b) for s, (g, b) in enumerate(slots) if g == f and pattern[e, s])
+            for e in range(len(orders))
+            if any(g == f and pattern[e, s] for s, (g, _) in enumerate(slots))
+        ]
+        weights[f] = min(gaps, default=0)
+    levels = [
+        max(sum(b) + weights[f] for s, (f, b) in enumerate(slots) if pattern[e, s]) for e in range(len(orders))
+    ]
+    return Recursion(
+        dim, order, fields, tuple(slots), tuple(levels), tuple(weights),
+        tuple(order - m for m in orders), tuple(tuple(bool(v) for v in row) for row in pattern),
+    )  # fmt: skip
+
+
+@lru_cache(maxsize=64)
+def _rows(rec: Recursion) -> list[tuple[int, tuple[int, ...]]]:
+    """The constraint rows (equation, multi-index c)."""
+    return [(e, c) for e, q in enumerate(rec.degrees) for c in multi_indices(rec.dim, q)]
+
+
+@lru_cache(maxsize=64)
+def _entries(rec: Recursion) -> dict[str, np.ndarray]:
+    """Every term of the constraints: its place in C, its coefficient, factor and power of length."""
+    place, taylor = index_of(rec.dim, rec.order), index_of(rec.dim, rec.degree)
+    found = []
+    for row, (e, c) in enumerate(_rows(rec)):
+        for s, (f, b) in enumerate(rec.slots):
+            if not rec.pattern[e][s]:
+                continue
+            for t, t_index in taylor.items():
+                rest = tuple(ci - ti for ci, ti in zip(c, t))
+                if min(rest) < 0:
+                    continue
+                a = tuple(r + bi for r, bi in zip(rest, b))
+                power = rec.levels[e] - sum(b) - rec.weights[f] + sum(t)
+                found.append((row, f * rec.size + place[a], e, s, t_index, factorial(a) / factorial(rest), power))
+    names = ("row", "col", "equation", "slot", "taylor", "factor", "power")
+    return {name: np.array(values) for name, values in zip(names, zip(*found))}
+
+
+def constraints(rec: Recursion, jac: Any, length: Any, xp: Any = jnp) -> tuple[Any, Any]:
+    """The constraint matrix of one particle and the factors of its right-hand side.
+
+    jac (E, S, T): Taylor coefficients of the operator's coefficients (T = 1 if constant);
+    length: scalar scale. Returns C (rows, F K) with rows of unit length, and the factors (rows,)
+    that turn the Taylor coefficients of the source into the right-hand side.
+    """
+    entries = _entries(rec)
+    constant = jac.shape[-1] == 1
+    keep = entries["taylor"] == 0 if constant else slice(None)
+    row, col, e, s, t, factor, power = (entries[k][keep] for k in entries)
+    powers = length ** xp.arange(int(power.max()) + 1)
+    values = jac[e, s, t] * factor * powers[power]
+    shape = (rec.n_rows, rec.fields * rec.size)
+    if xp is np:
+        matrix = np.zeros(shape)
+        np.add.at(matrix, (row, col), values)
+    else:
+        matrix = jnp.zeros(shape, values.dtype).at[row, col].add(values)
+    norm = xp.sqrt(xp.sum(matrix**2, axis=1))
+    norm = xp.where(norm > 0, norm, 1.0)
+    rows = _rows(rec)
+    lift = length ** xp.asarray([rec.levels[e] + sum(c) for e, c in rows])
+    return matrix / norm[:, None], lift / norm
+
+
+def source_rows(rec: Recursion, residual: Any) -> Any:
+    """Pick the right-hand side's Taylor coefficients (rows, N) from a residual (E, T, N) at u = 0."""
+    taylor = index_of(rec.dim, rec.degree)
+    e = np.array([e for e, _ in _rows(rec)])
+    t = np.array([taylor[c] for _, c in _rows(rec)])
+    return -residual[e, t]
+
+
+# ---------------------------------------------------------------- elimination
+
+
+@jax.custom_jvp
+def null_space(matrix: Any) -> tuple[Any, Any]:
+    """Orthonormal basis Z of the null space of C (r, k), and the pseudo-inverse Q of C (full rank).
+
+    Householder reflections in plain jnp, so that it batches without LAPACK.
+    """
+    r, k = matrix.shape
+    if r == 0:
+        return jnp.eye(k, dtype=matrix.dtype), jnp.zeros((k, 0), matrix.dtype)
+
+    def reflect(j, carry):
+        x, q = carry
+        column = jnp.where(jnp.arange(k) >= j, x[:, j], 0.0)
+        length = jnp.sqrt(jnp.sum(column**2))
+        pivot = column[j]
+        v = column.at[j].add(jnp.where(pivot >= 0, length, -length))
+        beta = jnp.sum(v**2)
+        v = v * jnp.sqrt(2.0 / jnp.where(beta > 0, beta, 1.0))
+        return x - jnp.outer(v, v @ x), q - jnp.outer(q @ v, v)
+
+    x, q = jax.lax.fori_loop(0, r, reflect, (matrix.T, jnp.eye(k, dtype=matrix.dtype)))
+    return q[:, r:], q[:, :r] @ _inverse_lower(x[:r].T)
+
+
+@null_space.defjvp
+def _null_space_jvp(primals, tangents):
+    # C Z = 0 gives dZ = -Q dC Z up to a rotation of Z, on which nothing that is used depends.
+    (matrix,), (change,) = primals, tangents
+    z, q = null_space(matrix)
+    dz = -q @ (change @ z)
+    dq = z @ ((change @ z).T @ (q.T @ q)) - q @ (change @ q)
+    return (z, q), (dz, dq)
+
+
+def _inverse_lower(lower: Any) -> Any:
+    """The inverse of a lower triangular matrix by forward substitution; zero pivots give zero rows."""
+    n = lower.shape[0]
+
+    def step(i, inverse):
+        row = jnp.where(jnp.arange(n) < i, lower[i], 0.0)
+        pivot = lower[i, i]
+        safe = jnp.where(jnp.abs(pivot) > 1e-13, pivot, jnp.inf)
+        return inverse.at[i].set((jnp.eye(n, dtype=lower.dtype)[i] - row @ inverse) / safe)
+
+    return jax.lax.fori_loop(0, n, step, jnp.zeros_like(lower))
+
+
+def free_indices(rec: Recursion, jac0: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The paper's choice of free and dependent Taylor coefficients (positions in 0..K-1).
+
+    The equation is solved for the pure highest derivative along one axis, the one with the
+    largest coefficient (the last of equals: y for Laplace), so the coefficients whose degree
+    along that axis reaches the operator's order depend on the others.
+
+    jac0 (S, N): the operator's coefficients at the particles.
+    """
+    m = rec.order - rec.degrees[0]
+    sizes = []
+    for axis in range(rec.dim):
+        pure = tuple(m if k == axis else 0 for k in range(rec.dim))
+        here = [s for s, (_, b) in enumerate(rec.slots) if b == pure and rec.pattern[0][s]]
+        sizes.append(np.abs(jac0[here[0]]).min() if here else 0.0)
+    if m > 0 and max(sizes) <= 1e-8 * np.abs(jac0).max():
+        raise ValueError(
+            "method: I, II and III solve the equation for a pure highest derivative along an axis, and every such "
+            'derivative is missing or its coefficient vanishes at a particle; use method="S", which needs none'
+        )
+    axis = rec.dim - 1 - int(np.argmax(np.array(sizes[::-1]) >= 0.999 * max(sizes)))
+    along = np.array([a[axis] for a in multi_indices(rec.dim, rec.order)])
+    return np.flatnonzero(along < m), np.flatnonzero(along >= m)
+
+
+@partial(jax.jit, static_argnums=(1, 2))
+def _substitute(matrix: Any, free: tuple[int, ...], dependent: tuple[int, ...]) -> tuple[Any, Any]:
+    k = matrix.shape[1]
+    inverse = general_inverse(matrix[:, np.array(dependent)])
+    z = jnp.zeros((k, len(free)), matrix.dtype).at[np.array(free), np.arange(len(free))].set(1.0)
+    z = z.at[np.array(dependent)].set(-inverse @ matrix[:, np.array(free)])
+    return z, jnp.zeros((k, matrix.shape[0]), matrix.dtype).at[np.array(dependent)].set(inverse)
+
+
+def substitution(matrix: Any, free: np.ndarray, dependent: np.ndarray) -> tuple[Any, Any]:
+    """Z and Q with the free coefficients themselves as coordinates (the paper's eqs. 38, 41)."""
+    if len(dependent) == 0:
+        return jnp.eye(matrix.shape[1], dtype=matrix.dtype), jnp.zeros((matrix.shape[1], 0), matrix.dtype)
+    return _substitute(matrix, tuple(int(i) for i in free), tuple(int(i) for i in dependent))
+
+
+@jax.custom_jvp
+def general_inverse(matrix: Any) -> Any:
+    """The inverse of a small square matrix: Gauss-Jordan with row pivoting in plain jnp."""
+    n = matrix.shape[0]
+    work = jnp.concatenate([matrix, jnp.eye(n, dtype=matrix.dtype)], axis=1)
+
+    def step(k, work):
+        pivot = jnp.argmax(jnp.where(jnp.arange(n) >= k, jnp.abs(work[:, k]), -1.0))
+        row, other = work[pivot], work[k]
+        work = work.at[pivot].set(other)
+        row = row / row[k]
+        column = work[:, k].at[k].set(0.0)
+        return (work - jnp.outer(column, row)).at[k].set(row)
+
+    return jax.lax.fori_loop(0, n, step, work)[:, n:]
+
+
+@general_inverse.defjvp
+def _general_inverse_jvp(primals, tangents):
+    inverse = general_inverse(primals[0])
+    return inverse, -inverse @ (tangents[0] @ inverse)

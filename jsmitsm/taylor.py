@@ -1,0 +1,133 @@
+"""Multi-indices and the tables of truncated Taylor arithmetic."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+MultiIndex = tuple[int, ...]
+
+
+@lru_cache(maxsize=None)
+def multi_indices(dim: int, degree: int) -> tuple[MultiIndex, ...]:
+    """All multi-indices of ``dim`` axes up to total ``degree``, graded.
+
+    Inside a degree they descend in the first axis, so every lower degree is a prefix.
+    A negative degree gives none.  Raises ``ValueError`` if ``dim`` is below 1.
+
+    >>> multi_indices(2, 2)
+    ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
+    """
+    if dim < 1:
+        raise ValueError(f"dim must be at least 1, got {dim!r}")
+    return tuple(a for d in range(degree + 1) for a in _of_degree(dim, d))
+
+
+def _of_degree(dim: int, degree: int) -> Iterator[MultiIndex]:
+    """The multi-indices of exactly this degree."""
+    if dim == 1:
+        yield (degree,)
+        return
+    for first in range(degree, -1, -1):
+        for rest in _of_degree(dim - 1, degree - first):
+            yield (first, *rest)
+
+
+@lru_cache(maxsize=None)
+def index_of(dim: int, degree: int) -> dict[MultiIndex, int]:
+    """Position of every multi-index in ``multi_indices(dim, degree)``.
+
+    >>> index_of(2, 2)[(1, 1)]
+    4
+    """
+    return {a: i for i, a in enumerate(multi_indices(dim, degree))}
+
+
+def factorial(a: MultiIndex) -> int:
+    """a! = a_1! a_2! ...
+
+    >>> factorial((3, 2))
+    12
+    """
+    return math.prod(math.factorial(k) for k in a)
+
+
+def count(dim: int, degree: int) -> int:
+    """How many multi-indices have total degree at most ``degree``."""
+    return math.comb(degree + dim, dim) if degree >= 0 else 0
+
+
+@lru_cache(maxsize=None)
+def degree_of_count(dim: int, terms: int) -> int:
+    """The degree whose graded prefix has this many terms."""
+    degree = 0
+    while count(dim, degree) < terms:
+        degree += 1
+    if count(dim, degree) != terms:
+        raise ValueError(f"{terms} is not a number of Taylor coefficients in {dim} dimensions")
+    return degree
+
+
+@lru_cache(maxsize=None)
+def degrees(dim: int, degree: int) -> np.ndarray:
+    """|a| of every multi-index, (T,)."""
+    return np.array([sum(a) for a in multi_indices(dim, degree)])
+
+
+def _positions(places: list[int]) -> Any:
+    """A slice where the positions are consecutive (a view is cheaper than a copy)."""
+    if places == list(range(places[0], places[0] + len(places))):
+        return slice(places[0], places[0] + len(places))
+    return np.array(places)
+
+
+@lru_cache(maxsize=None)
+def product_rows(dim: int, left: int, right: int, degree: int) -> tuple[tuple[int, Any], ...]:
+    """For each index a of the left factor: how many terms of the right one count, and where.
+
+    The right factor's terms that keep a + b within ``degree`` are a prefix, so a product is
+    ``out[places] += x[a] * y[:n]``.
+    """
+    place = index_of(dim, degree)
+    rows = []
+    for a in multi_indices(dim, left):
+        some = multi_indices(dim, min(right, degree - sum(a)))
+        rows.append((len(some), _positions([place[add(a, b)] for b in some]) if some else None))
+    return tuple(rows)
+
+
+@lru_cache(maxsize=None)
+def product_pairs(dim: int, left: int, right: int, low: int, high: int) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs (I, J) of a product's output rows of degree low..high, each (rows, M).
+
+    Padded with the position one past the end, where the factors hold a row of zeros.
+    """
+    lefts, rights = index_of(dim, left), index_of(dim, right)
+    rows: list[list[tuple[int, int]]] = []
+    for c in multi_indices(dim, high)[count(dim, low - 1):]:
+        pairs = []
+        for a, i in lefts.items():
+            b = tuple(m - n for m, n in zip(c, a, strict=True))
+            if b in rights:
+                pairs.append((i, rights[b]))
+        rows.append(pairs)
+    width = max(len(r) for r in rows)
+    padding = (len(lefts), len(rights))
+    table = np.array([r + [padding] * (width - len(r)) for r in rows])
+    return table[..., 0], table[..., 1]
+
+
+@lru_cache(maxsize=None)
+def block_rows(dim: int, left: int, right: int) -> tuple[Any, ...]:
+    """For each index a of degree ``left``: places of a + b in degree left + right, all |b| = right."""
+    place = {c: i for i, c in enumerate(_of_degree(dim, left + right))}
+    return tuple(_positions([place[add(a, b)] for b in _of_degree(dim, right)]) for a in _of_degree(dim, left))
+
+
+def add(a: MultiIndex, b: MultiIndex) -> MultiIndex:
+    """The sum of two multi-indices."""
+    return tuple(m + n for m, n in zip(a, b, strict=True))
