@@ -1,4 +1,8 @@
-"""All particles' rows: the per-particle moment systems, vmapped in blocks that stay in cache."""
+"""The rows of all particles, and the global system they make.
+
+The per-particle moment systems are vmapped in blocks that stay in cache; the sparsity pattern
+is fixed by the stencils and known before.
+"""
 
 from __future__ import annotations
 
@@ -9,63 +13,104 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jsmitsm import moments
 from jsmitsm.kernels import Kernel
-from jsmitsm.moments import Elimination, Row, Scheme, eliminate, row, support
+from jsmitsm.moments import Elimination, Row, Scheme, Support
+from jsmitsm.recursion import row_levels
 
-# Particles per block: larger ones leave the cache and are several times slower.
+# Particles per block: larger blocks leave the cache and are several times slower.
 _BLOCK = 64
 
-TRACES = {"rows": 0}
+# How often the local phase was compiled; read by the tests.
+TRACES = {"rows": 0, "coefficients": 0}
 
 
 class Operands(NamedTuple):
-    """What the particles of a class need besides their neighbours; the leading axis is theirs.
+    """The numbers behind the rows of n particles.
 
-    jac is (n, E, S, T), or (1, E, S, 1) where one serves all; solution is given where one
-    elimination serves all particles.
+    jac (n, E, S, T): Taylor coefficients of the operator's coefficients, or (1, E, S, 1) where
+    one set serves all; own (n, n_own, S_own): the particles' own conditions; data
+    (N, n_data, S_data): the conditions neighbours contribute, of every particle of the cloud;
+    shared: an elimination that is the same everywhere, with lifts for unit length.
     """
 
     jac: Any
-    own: Any  # (n, n_own, S_own)
-    data: Any  # (N, n_data, S_data), of all particles
+    own: Any
+    data: Any
+    shared: Elimination | None
 
 
 @partial(jax.jit, static_argnums=(0,))
-def block_rows(
-    scheme: Scheme, points: Any, kernel: Kernel | None, ids: Any, neighbours: Any, operands: Operands,
-    shared: tuple[Any, Any, Any] | None,
-) -> Row:  # fmt: skip
-    """The rows of the particles ``ids`` (n,) with ``neighbours`` (n, w).
-
-    shared: basis, particular part and row norms of a recursion that is the same everywhere.
-    """
+def rows(scheme: Scheme, points: Any, kernel: Kernel | None, ids: Any, neighbours: Any, operands: Operands) -> Row:
+    """The rows of the particles ``ids`` (n,) with ``neighbours`` (n, w); particle axis first."""
     TRACES["rows"] += 1
-    constant = operands.jac.shape[0] == 1
 
-    @partial(jax.checkpoint, policy=None)
-    def particle(args):
-        i, near_ids, jac, own = args
-        near = support(points, i, near_ids, kernel)
-        jac = operands.jac[0] if constant else jac
-        solution = _rescaled(scheme, shared, near.length) if shared else eliminate(scheme, jac, near.length)
-        data = operands.data[jnp.where(near.inside, near_ids, i)] if scheme.n_data else None
-        if scheme.n_data:
-            data = jnp.where(near.inside[:, None, None], data, 0.0)
-        derivatives = kernel_derivatives(scheme, kernel, near) if scheme.method == "III" else None
-        return row(scheme, near, solution, own, data, derivatives)
+    def particle(i, near_ids, jac, own):
+        return moments.row(scheme, *_prepared(scheme, points, kernel, i, near_ids, operands, jac, own))
 
-    jac = jnp.zeros((ids.shape[0], 0)) if constant else operands.jac
-    return jax.lax.map(particle, (ids, neighbours, jac, operands.own), batch_size=_BLOCK)
+    return _mapped(particle, ids, neighbours, operands)
 
 
-def _rescaled(scheme: Scheme, shared: tuple[Any, Any, Any], length: Any) -> Elimination:
-    """A shared elimination with this particle's powers of length."""
-    from jsmitsm.recursion import lift_powers
+@partial(jax.jit, static_argnums=(0,))
+def coefficients(
+    scheme: Scheme, points: Any, kernel: Kernel | None, ids: Any, neighbours: Any, operands: Operands,
+    u: Any, gamma: Any, source: Any, given: Any,
+) -> Any:  # fmt: skip
+    """Taylor coefficients (n, F, K) of the particles ``ids`` from all values ``u`` (N, F).
 
-    basis, particular, rows_norm = shared
-    lift = length ** jnp.asarray(lift_powers(scheme.rec)) / rows_norm[0]
-    return Elimination(basis, particular, lift, rows_norm[1])
+    gamma (N, n_data): the values of the neighbours' conditions; source (n, rows); given (n, n_own).
+    """
+    TRACES["coefficients"] += 1
+
+    def particle(i, near_ids, jac, own, source, given):
+        prepared = _prepared(scheme, points, kernel, i, near_ids, operands, jac, own)
+        index = jnp.where(near_ids >= 0, near_ids, i)
+        values = jnp.concatenate([u[index].reshape(-1), gamma[index].reshape(-1)])
+        return moments.coefficients(scheme, *prepared, values, source, given)
+
+    return _mapped(particle, ids, neighbours, operands, source, given)
 
 
-def kernel_derivatives(scheme: Scheme, kernel: Kernel, near: Any) -> Any:
+def _mapped(particle: Any, ids: Any, neighbours: Any, operands: Operands, *more: Any) -> Any:
+    """``particle`` over all particles, in blocks; intermediates are made again in the adjoint."""
+    one_for_all = operands.jac.shape[0] == 1
+
+    def one(args):
+        i, near_ids, jac, own, *rest = args
+        made = particle(i, near_ids, operands.jac[0] if one_for_all else jac, own, *rest)
+        empty.update({k: x for k, x in enumerate(jax.tree.leaves(made)) if not x.size})
+        return _without_empty(made)
+
+    # Arrays without numbers cannot be cut into blocks: None stands for them on the way.
+    empty: dict[int, Any] = {}
+    each = _without_empty([None if one_for_all else operands.jac, operands.own, *more])
+    made = jax.lax.map(jax.checkpoint(one), (ids, neighbours, *each), batch_size=_BLOCK)
+    leaves, shape = jax.tree.flatten(made, is_leaf=lambda x: x is None)
+    full = [jnp.zeros((ids.shape[0], *empty[k].shape)) if k in empty else x for k, x in enumerate(leaves)]
+    return jax.tree.unflatten(shape, full)
+
+
+def _without_empty(tree: Any) -> Any:
+    return jax.tree.map(lambda x: x if x.size else None, tree)
+
+
+def _prepared(scheme, points, kernel, i, near_ids, operands: Operands, jac, own):
+    """The support, elimination and conditions of one particle."""
+    near = moments.support(points, i, near_ids, kernel)
+    if operands.shared is None:
+        solution = moments.eliminate(scheme, jac, near.length)
+    else:
+        lift = operands.shared.lift * near.length ** jnp.asarray(row_levels(scheme.rec))
+        solution = operands.shared._replace(lift=lift)
+    data = None
+    if scheme.n_data:
+        data = operands.data[jnp.where(near_ids >= 0, near_ids, i)]
+        data = jnp.where(near.inside[:, None, None], data, 0.0).at[0].set(0.0)
+    return near, solution, own, data, _tests(scheme, near)
+
+
+def _tests(scheme: Scheme, near: Support) -> Any:
+    """Method III tests with kernel derivatives, one for each free coefficient."""
+    if scheme.method != "III":
+        return None
     raise NotImplementedError

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jsmitsm.kernels import EDGE, Kernel
+from jsmitsm.kernels import EDGE, Gaussian, Kernel
 from jsmitsm.recursion import Recursion, Slot, constraints, general_inverse, null_space, substitution
 from jsmitsm.taylor import factorial, index_of, multi_indices
 
@@ -71,6 +71,7 @@ class Support(NamedTuple):
     weight: Any  # (ns,)
     inside: Any  # (ns,) bool
     length: Any  # ()
+    kernel: Kernel  # the particle's own
 
 
 def support(points: Any, i: Any, neighbours: Any, kernel: Kernel | None) -> Support:
@@ -83,15 +84,16 @@ def support(points: Any, i: Any, neighbours: Any, kernel: Kernel | None) -> Supp
     square = jnp.sum(offset**2, axis=1)
     apart = square > 0
     distance = jnp.where(apart, jnp.sqrt(jnp.where(apart, square, 1.0)), 0.0)
-    if kernel is None:
-        length = jnp.max(distance)
-        weight, inside = jnp.exp(-4.0 * square / length**2), valid
-    else:
-        own = kernel.at(i)
-        inside = valid & (distance <= own.d * own.h * EDGE)
-        length = own.h * jnp.minimum(own.d, 2.0)
-        weight = jnp.maximum(own.profile(distance / own.h), 0.0)
-    return Support(offset / length, jnp.where(inside, weight, 0.0), inside, length)
+    own = kernel.at(i) if kernel is not None else _default_kernel(distance)
+    inside = valid & (distance <= own.d * own.h * EDGE) if kernel is not None else valid
+    length = own.h * jnp.minimum(own.d, 2.0)
+    weight = jnp.maximum(own.profile(distance / own.h), 0.0)
+    return Support(offset / length, jnp.where(inside, weight, 0.0), inside, length, own)
+
+
+def _default_kernel(distance: Any) -> Kernel:
+    """A Gauss function that has fallen to exp(-4) at the farthest neighbour."""
+    return Gaussian.tree_unflatten(None, (jnp.max(distance) / 2.0, 2.0, None))
 
 
 # ------------------------------------------------------------ polynomials
@@ -252,6 +254,26 @@ def eliminate(scheme: Scheme, jac: Any, length: Any) -> Elimination:
     return Elimination(z[:, : len(scheme.free)], q, lift, rows)
 
 
+def eliminate_on_host(scheme: Scheme, jac: np.ndarray) -> Elimination:
+    """:func:`eliminate` at unit length in numpy, where one elimination serves all particles."""
+    rec = scheme.rec
+    matrix, lift = constraints(rec, jac, 1.0, np)
+    rows = matrix[np.array(rec.equation_rows)]
+    white = np.kron(np.eye(rec.fields), whitening(rec.dim, rec.order))
+    if scheme.method == "SSPH":
+        return Elimination(white, np.zeros((white.shape[0], len(matrix))), lift, rows)
+    if scheme.method == "S":
+        q, r = np.linalg.qr((matrix @ white).T, mode="complete")
+        k = len(matrix)
+        return Elimination(white @ q[:, k:], white @ q[:, :k] @ np.linalg.inv(r[:k]).T, lift, rows)
+    free, dependent = np.array(scheme.free), np.array(scheme.dependent, int)
+    basis, particular = np.zeros((rec.size, len(free))), np.zeros((rec.size, len(matrix)))
+    particular[dependent] = np.linalg.inv(matrix[:, dependent])
+    basis[free, np.arange(len(free))] = 1.0
+    basis[dependent] = -particular[dependent] @ matrix[:, free]
+    return Elimination(basis, particular, lift, rows)
+
+
 def _all_free(scheme: Scheme) -> np.ndarray:
     return np.setdiff1d(np.arange(scheme.rec.size), scheme.dependent)
 
@@ -371,3 +393,36 @@ def _collocated(scheme, near, solution, own, data, derivatives):
     own_weight = jnp.abs(w[np.arange(rec.fields), np.arange(rec.fields)])
     others = jnp.sum(jnp.abs(w), axis=0) - own_weight
     return -w, v, v_own, others / jnp.where(own_weight > 0, own_weight, 1.0), defect, system
+
+
+def coefficients(
+    scheme: Scheme, near: Support, solution: Elimination, own: Any, data: Any, derivatives: Any,
+    values: Any, source: Any, given: Any,
+) -> Any:  # fmt: skip
+    """The particle's Taylor coefficients (F, K), unscaled, from its neighbours' values.
+
+    values (rows of data,): the neighbours' values and their conditions' values; source (rows,):
+    the recursion's right-hand side; given (n_own,): the values of its own conditions.
+    """
+    rec, fields = scheme.rec, scheme.rec.fields
+    collocated = scheme.method == "SSPH"
+    system = local_system(scheme, near, solution, own, data, derivatives, skip_self=not collocated)
+    ns = near.weight.shape[0]
+    power = near.length ** jnp.asarray(rec.weights, near.length.dtype)
+    given = jnp.zeros(0) if given is None else given
+    scaled = (values[: ns * fields].reshape(ns, fields) * power).reshape(-1)
+    scaled = jnp.concatenate([scaled, values[ns * fields :] * system.data_scale.reshape(-1)])
+    part = solution.particular @ (solution.lift * source)
+    if scheme.n_own and not collocated:
+        lack = system.own_scale * given - system.own_rows @ part
+        part = part + solution.basis @ (system.own_solve @ lack)
+    rest = scaled - system.values @ part
+    if system.tests is None:
+        a = jnp.sqrt(system.weight)[:, None] * system.phi
+        inverse = gram_inverse(a, 1e-13 if collocated else None)
+        free = _solve_gram(a, inverse, a.T @ (jnp.sqrt(system.weight) * rest))
+    else:
+        free = general_inverse(system.tests.T @ system.phi) @ (system.tests.T @ rest)
+    scaled_u = (part + system.reduced @ free).reshape(fields, rec.size)
+    degrees = np.array([float(sum(a)) for a in multi_indices(rec.dim, rec.order)])
+    return scaled_u * near.length ** (-degrees) / power[:, None]

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
+import operator
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -56,7 +58,7 @@ def _field_jvp(primals: Any, tangents: Any, *, field: int, index: MultiIndex) ->
         for b, c in zip(higher, np.asarray(dx), strict=True)
         if c != 0
     ]
-    return out, sum(parts[1:], parts[0]) if parts else ad.Zero(jax.typeof(out).to_tangent_aval())
+    return out, _total(parts) if parts else ad.Zero(jax.typeof(out).to_tangent_aval())
 
 
 def _field_batch(args: Any, axes: Any, *, field: int, index: MultiIndex) -> Any:
@@ -80,6 +82,11 @@ def _stack(scalars: Any) -> jax.Array:
     if len(scalars) == 1:
         return jax.lax.broadcast(scalars[0], (1,))
     return jax.lax.concatenate([jax.lax.broadcast(s, (1,)) for s in scalars], 0)
+
+
+def _total(parts: Any) -> Any:
+    """A sum without the leading zero of the builtin, which would be traced too."""
+    return functools.reduce(operator.add, parts)
 
 
 def _is_scalar(value: Any) -> bool:
@@ -343,14 +350,11 @@ def laplacian(u: Any) -> Any:
     10.0
     """
     if isinstance(u, Field):
-        total = Field(u.dim, {})
-        for i in range(u.dim):
-            total = total + u._shifted(tuple(2 * k for k in _unit(u.dim, i)))
-        return total
+        return _total(u._shifted(tuple(2 * k for k in _unit(u.dim, i))) for i in range(u.dim))
     if isinstance(u, LocalField):
         return u._map(laplacian)
     function = _array_valued(u)
-    return lambda x: sum(_along(_along(function, i), i)(_point(x)) for i in range(len(_point(x))))
+    return lambda x: _total(_along(_along(function, i), i)(_point(x)) for i in range(len(_point(x))))
 
 
 def divergence(v: Any) -> Any:
@@ -367,10 +371,8 @@ def divergence(v: Any) -> Any:
         raise ValueError("v must be a vector field with D components, got a scalar field; did you mean grad(u)?")
     if isinstance(v, LocalField):
         _check_last_axis(v.shape, v.dim)
-        total = v[..., 0]._shifted(_unit(v.dim, 0)) if v.ndim == 1 else partial(v[..., 0], _unit(v.dim, 0))
-        for i in range(1, v.dim):
-            total = total + partial(v[..., i], _unit(v.dim, i))
-        return total
+        rows = (slice(None),) * (v.ndim - 1)
+        return _total(partial(v[(*rows, i)], _unit(v.dim, i)) for i in range(v.dim))
     function = _array_valued(v)
 
     def total_slope(x: Any) -> Any:
@@ -385,7 +387,7 @@ def divergence(v: Any) -> Any:
 
             return part
 
-        return sum(_along(component(i), i)(x) for i in range(dim))
+        return _total(_along(component(i), i)(x) for i in range(dim))
 
     return total_slope
 

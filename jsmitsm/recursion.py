@@ -128,6 +128,11 @@ def _entries(rec: Recursion) -> dict[str, np.ndarray]:
     return {name: np.array(values) for name, values in zip(names, zip(*found))}
 
 
+def row_levels(rec: Recursion) -> np.ndarray:
+    """The power of length that makes each constraint free of units."""
+    return np.array([float(rec.levels[e] + sum(c)) for e, c in _rows(rec)])
+
+
 def constraints(rec: Recursion, jac: Any, length: Any, xp: Any = jnp) -> tuple[Any, Any]:
     """The constraint matrix of one particle and the factors of its right-hand side.
 
@@ -149,9 +154,7 @@ def constraints(rec: Recursion, jac: Any, length: Any, xp: Any = jnp) -> tuple[A
         matrix = jnp.zeros(shape, values.dtype).at[row, col].add(values)
     norm = xp.sqrt(xp.sum(matrix**2, axis=1))
     norm = xp.where(norm > 0, norm, 1.0)
-    rows = _rows(rec)
-    lift = length ** xp.asarray([rec.levels[e] + sum(c) for e, c in rows])
-    return matrix / norm[:, None], lift / norm
+    return matrix / norm[:, None], length ** xp.asarray(row_levels(rec)) / norm
 
 
 def source_rows(rec: Recursion, residual: Any) -> Any:

@@ -115,7 +115,7 @@ def product_pairs(dim: int, left: int, right: int, low: int, high: int) -> tuple
             if b in rights:
                 pairs.append((i, rights[b]))
         rows.append(pairs)
-    width = max(len(r) for r in rows)
+    width = max(1, *(len(r) for r in rows))
     padding = (len(lefts), len(rights))
     table = np.array([r + [padding] * (width - len(r)) for r in rows])
     return table[..., 0], table[..., 1]

@@ -1,0 +1,397 @@
+"""Evenly spaced particles: scattering, relaxing and measuring them.
+
+A domain is known here only through ``distance(x (M, D)) -> (d (M,), outward (M, D))``, a signed
+distance that need be accurate only near the boundary. Everything runs on the host in numpy.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from jsmitsm.clouds import INTERIOR, Cloud
+
+Spacing = Callable[[np.ndarray], np.ndarray]
+
+# Particles per spacing^D of the densest even arrangement: hexagons in 2D; in 3D a little below the
+# 1.41 of a face-centred lattice, which relaxation from a random start does not find.
+_DENSITY = {1: 1.0, 2: 2.0 / np.sqrt(3.0), 3: 1.25}
+_NEIGHBOURS = {2: 8, 3: 14}
+# Base cells along the longest side: what decides how small a part of the domain is noticed at all.
+_BASE = {1: 256, 2: 48, 3: 20}
+# No interior particle comes closer to the boundary than this many spacings.
+CLEARANCE = 0.5
+
+
+class Region(Protocol):
+    """What the packing has to know about a domain."""
+
+    def distance(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Signed distance (M,), negative inside, and the unit direction of its growth (M, D)."""
+        ...
+
+
+class Quality(NamedTuple):
+    """How evenly the particles of a cloud lie; see :func:`quality`."""
+
+    fill: float
+    separation: float
+    mesh_ratio: float
+    evenness: float
+    fill_distance: float
+    separation_distance: float
+
+
+class Cells(NamedTuple):
+    """Cubes of an octree: centres (M, D), widths (M,), and what the region says at the centres."""
+
+    centers: np.ndarray
+    widths: np.ndarray
+    distance: np.ndarray
+    outward: np.ndarray
+    spacing: np.ndarray
+
+
+def spacing_function(spacing: Any) -> Spacing:
+    """A number or a user's function as a function (M, D) -> (M,) that checks what it returns."""
+    if not callable(spacing):
+        value = np.asarray(spacing)
+        if value.ndim or value.dtype.kind not in "fiu" or not np.isfinite(value) or value <= 0:
+            raise ValueError(
+                f"spacing: expected a positive finite number or a function (M, D) -> (M,), got {spacing!r}"
+            )
+        return lambda x: np.full(len(x), float(value))
+
+    def checked(x: np.ndarray) -> np.ndarray:
+        h = np.asarray(spacing(x), dtype=np.float64)
+        if h.shape != (len(x),):
+            raise ValueError(
+                f"spacing: the function returned shape {h.shape} for points of shape {x.shape}, "
+                f"expected {(len(x),)}; compute it from x[:, 0], x[:, 1], ..."
+            )
+        bad = np.flatnonzero(~(np.isfinite(h) & (h > 0)))
+        if len(bad):
+            raise ValueError(
+                f"spacing: the function returned {h[bad[0]]} at {x[bad[0]]}, expected positive finite lengths "
+                "everywhere in the domain; bound it from below with np.maximum"
+            )
+        return h
+
+    return checked
+
+
+def refine(
+    region: Region, spacing: Spacing, lo: np.ndarray, hi: np.ndarray, fraction: float, inside: bool, base: float = 0.0
+) -> tuple[Cells, Cells]:
+    """Split cubes until none is wider than ``fraction`` of the spacing.
+
+    Returns the finished cells near the boundary (with ``inside`` also those in the domain) and the
+    coarse ones left behind. ``base`` is the width to start from, chosen here where it is 0.
+    """
+    dim = len(lo)
+    width = base or float((hi - lo).max()) / _BASE[dim]
+    counts = np.maximum(np.ceil((hi - lo) / width - 1e-9).astype(int), 1)
+    start = (lo + hi) / 2 - counts * width / 2
+    index = np.stack(np.meshgrid(*map(np.arange, counts), indexing="ij"), axis=-1).reshape(-1, dim)
+    centers = start + (index + 0.5) * width
+    children = np.array(list(itertools.product((-0.25, 0.25), repeat=dim)))
+    done: list[Cells] = []
+    left: list[Cells] = []
+    changes = _sign_changes(np.sign(region.distance(centers)[0]).reshape(counts)).reshape(-1)
+    while len(centers):
+        distance, outward = region.distance(centers)
+        # Twice the half diagonal: a signed distance function may be wrong by that factor.
+        near = ~(np.abs(distance) > np.sqrt(dim) * width) | changes
+        wanted = near | (distance < 0) if inside else near
+        # Outside of the domain a user's spacing need not be defined: ask at the foot point.
+        feet = np.where((distance > 0)[:, None] & near[:, None], centers - distance[:, None] * outward, centers)
+        h = np.full(len(centers), np.inf)
+        h[wanted] = spacing(feet[wanted])
+        cells = Cells(centers, np.full(len(centers), width), distance, outward, h)
+        left.append(_take(cells, ~wanted))
+        done.append(_take(cells, wanted & (width <= fraction * h * (1 + 1e-9))))
+        split = centers[wanted & (width > fraction * h * (1 + 1e-9))]
+        centers = (split[:, None] + width * children).reshape(-1, dim)
+        changes = np.zeros(len(centers), bool)
+        width /= 2
+        if len(centers) > 20_000_000:
+            raise ValueError(
+                f"spacing: needs more than {len(centers)} cells of width {width:.3g} in a domain of size "
+                f"{(hi - lo).max():.3g}; enlarge the spacing, or narrow the bounds if they are far too wide"
+            )
+    return _join(done), _join(left)
+
+
+def _sign_changes(sign: np.ndarray) -> np.ndarray:
+    """Cells of a grid next to one of the other sign."""
+    changes = np.zeros(sign.shape, bool)
+    for axis in range(sign.ndim):
+        s, c = np.moveaxis(sign, axis, 0), np.moveaxis(changes, axis, 0)
+        other = s[1:] != s[:-1]
+        c[1:] |= other
+        c[:-1] |= other
+    return changes
+
+
+def _take(cells: Cells, mask: np.ndarray) -> Cells:
+    return Cells(*(field[mask] for field in cells))
+
+
+def _join(parts: list[Cells]) -> Cells:
+    return Cells(*(np.concatenate(fields) for fields in zip(*parts)))
+
+
+def fill(
+    region: Region, spacing: Spacing, lo: np.ndarray, hi: np.ndarray, boundary: np.ndarray, seed: int, uniform: bool
+) -> np.ndarray:
+    """Interior particles (M, D) for a given boundary (B, D), evenly spaced, along a Morton curve."""
+    if len(lo) == 1:
+        return _fill_line(region, spacing, np.sort(boundary[:, 0]))
+    rng = np.random.default_rng(seed)
+    points = _scatter(region, spacing, lo, hi, rng, uniform)
+    points = points[_clear(region, points, spacing(points), 0.9 * CLEARANCE)] if len(points) else points
+    if not len(points):
+        return points
+    points = relax(region, points, boundary, spacing, 20)
+    points = _repair(region, points, boundary, spacing)
+    points = relax(region, points, boundary, spacing, 10)
+    points = points[_clear(region, points, spacing(points), 0.8 * CLEARANCE)]
+    return points[np.argsort(morton(points, lo, hi), kind="stable")]
+
+
+def _fill_line(region: Region, spacing: Spacing, ends: np.ndarray) -> np.ndarray:
+    """Interior particles of the intervals between successive ends that lie in the domain."""
+    parts = [np.zeros((0, 1))]
+    for a, b in zip(ends[:-1], ends[1:]):
+        if region.distance(np.array([[(a + b) / 2]]))[0][0] < 0:
+            parts.append(divide(np.linspace(a, b, 2001)[:, None], spacing)[0][1:-1])
+    return np.concatenate(parts)
+
+
+def divide(path: np.ndarray, spacing: Spacing) -> tuple[np.ndarray, np.ndarray]:
+    """Points (n + 1, D) along a path (M, D), ends kept, a constant number of local spacings apart.
+
+    Also the piece of the path each lies on: k between path[k] and path[k + 1].
+    """
+    lengths = path_lengths(path, spacing)
+    at = np.linspace(0.0, lengths[-1], max(1, int(np.rint(lengths[-1]))) + 1)
+    points = np.stack([np.interp(at, lengths, x) for x in path.T], axis=1)
+    points[0], points[-1] = path[0], path[-1]
+    return points, np.clip(np.searchsorted(lengths, at, side="right") - 1, 0, len(path) - 2)
+
+
+def path_lengths(path: np.ndarray, spacing: Spacing) -> np.ndarray:
+    """Lengths (M,) along a path (M, D) from its start, in local spacings."""
+    rate = 1.0 / spacing(path)
+    steps = np.linalg.norm(np.diff(path, axis=0), axis=1) * (rate[1:] + rate[:-1]) / 2
+    return np.concatenate([[0.0], np.cumsum(steps)])
+
+
+def _scatter(
+    region: Region, spacing: Spacing, lo: np.ndarray, hi: np.ndarray, rng: np.random.Generator, uniform: bool
+) -> np.ndarray:
+    """A start of the right density: octree cells of at most one particle each, dithered along a Morton curve."""
+    dim = len(lo)
+    fraction = _DENSITY[dim] ** (-1.0 / dim)
+    base = 0.0
+    if uniform:  # cells of exactly one particle: the start is a jittered lattice
+        base = fraction * float(spacing(lo[None])[0])
+        base *= 2.0 ** max(0.0, np.floor(np.log2((hi - lo).max() / _BASE[dim] / base)))
+    shift = rng.uniform(0.0, 0.5, dim) * fraction * spacing_at_most(spacing, lo, hi, uniform)
+    cells, _ = refine(region, spacing, lo - shift, hi + shift, fraction, True, base)
+    order = np.argsort(morton(cells.centers, lo, hi), kind="stable")
+    cells = _take(cells, order)
+    expected = np.cumsum(_DENSITY[dim] * (cells.widths / cells.spacing) ** dim) * (1 - 1e-9)
+    chosen = np.diff(np.floor(expected + rng.uniform()), prepend=0.0) > 0
+    jitter = rng.uniform(-0.35, 0.35, (len(expected), dim)) * cells.widths[:, None]
+    points = (cells.centers + jitter)[chosen]
+    return points[region.distance(points)[0] < 0] if len(points) else points
+
+
+def spacing_at_most(spacing: Spacing, lo: np.ndarray, hi: np.ndarray, uniform: bool) -> float:
+    """The spacing where it is constant; a hundredth of the box otherwise, a harmless shift of the lattice."""
+    return float(spacing(lo[None])[0]) if uniform else float((hi - lo).max()) / 100
+
+
+def morton(points: np.ndarray, lo: np.ndarray, hi: np.ndarray) -> np.ndarray:
+    """Place of each point along a space-filling curve: interleaved bits of its coordinates."""
+    dim = points.shape[1]
+    bits = 60 // dim
+    scaled = np.clip((points - lo) / (hi - lo).max(), 0.0, 1.0) * (2**bits - 1)
+    code = np.zeros(len(points), dtype=np.int64)
+    for axis, q in enumerate(scaled.astype(np.int64).T):
+        for bit in range(bits):
+            code |= ((q >> bit) & 1) << (dim * bit + axis)
+    return code
+
+
+def relax(region: Region, points: np.ndarray, boundary: np.ndarray, spacing: Spacing, steps: int) -> np.ndarray:
+    """Let the particles repel each other and a fixed boundary; returns new points (M, D)."""
+    from scipy.spatial import cKDTree
+
+    points, count = points.copy(), len(points)
+    k = min(_NEIGHBOURS[points.shape[1]] + 1, count + len(boundary))
+    fixed = spacing(boundary)
+    for step in range(steps):
+        every = np.concatenate([points, boundary])
+        if step % 4 == 0:  # particles move by a few hundredths of a spacing, neighbours outlast some steps
+            h = np.concatenate([spacing(points), fixed])
+            found = cKDTree(every, balanced_tree=False, compact_nodes=False).query(points, k=k)[1][:, 1:]
+            scale = 2.0 / (h[:count, None] + h[found])
+            reach = (scale * np.linalg.norm(points[:, None] - every[found], axis=2)) < 2.0
+            near = np.flatnonzero(((found >= count) & reach).any(axis=1))
+        points += h[:count, None] * repulsion(points, every, found, scale)
+        if len(near):
+            distance, outward = region.distance(points[near])
+            push = np.clip(distance + CLEARANCE * h[near], 0.0, 0.3 * h[near])
+            points[near] -= push[:, None] * outward
+    return points
+
+
+def repulsion(points: np.ndarray, every: np.ndarray, found: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    """One step (M, D) in spacings: forces q^-4 of the scaled distance q, cut off at 1.7 where the second shell begins."""
+    away = points[:, None] - every[found]
+    length = np.sqrt(np.einsum("mkd,mkd->mk", away, away))
+    q = np.maximum(length * scale, 0.3)
+    force = np.maximum(q**-4 - 1.7**-4, 0.0) / np.maximum(length, 1e-300)
+    move = 0.05 * np.einsum("mk,mkd->md", force, away)
+    size = np.linalg.norm(move, axis=1)
+    return move * np.minimum(1.0, 0.15 / np.maximum(size, 1e-300))[:, None]
+
+
+def _clear(region: Region, points: np.ndarray, h: np.ndarray, clearance: float) -> np.ndarray:
+    """Mask of the points inside and away from the boundary by ``clearance`` spacings."""
+    return region.distance(points)[0] < -clearance * h
+
+
+def _repair(region: Region, points: np.ndarray, boundary: np.ndarray, spacing: Spacing) -> np.ndarray:
+    """Drop particles that are crowded, put new ones into holes."""
+    from scipy.spatial import cKDTree
+
+    h = spacing(points)
+    every = np.concatenate([points, boundary])
+    gap, other = cKDTree(every).query(points, k=2)
+    crowded = gap[:, 1] < 0.6 * h
+    # Of a crowded pair of interior particles only one goes.
+    crowded &= ~((other[:, 1] > np.arange(len(points))) & (other[:, 1] < len(points)))
+    points = points[~crowded]
+    centers, radii, _ = circumspheres(np.concatenate([points, boundary]))
+    centers, radii = centers[radii > 0], radii[radii > 0]
+    inside = region.distance(centers)[0] < 0
+    centers, radii = centers[inside], radii[inside]
+    h = spacing(centers)
+    hole = (radii > 0.85 * h) & _clear(region, centers, h, CLEARANCE)
+    centers, h, radii = centers[hole], h[hole], radii[hole]
+    return np.concatenate([points, centers[thin(centers, 0.85 * h, -radii / h)]])
+
+
+def thin(points: np.ndarray, radii: np.ndarray, priority: np.ndarray) -> np.ndarray:
+    """Indices of a maximal subset with no two points closer than their radii; low priority values first."""
+    from scipy.spatial import cKDTree
+
+    if len(points) < 2:
+        return np.arange(len(points))
+    order = np.argsort(priority, kind="stable")
+    rank = np.empty(len(points), int)
+    rank[order] = np.arange(len(points))
+    k = min(32, len(points))
+    gap, other = cKDTree(points).query(points, k=k)
+    close = gap < np.minimum(radii[:, None], radii[other])
+    close[:, 0] = False
+    a, b = np.nonzero(close)[0], other[close]
+    a, b = np.concatenate([a, b]), np.concatenate([b, a])  # a list cut off at k need not be symmetric
+    state = np.zeros(len(points), int)  # 0 undecided, 1 taken, -1 dropped
+    while (state == 0).any():
+        live = (state[a] == 0) & (state[b] == 0)
+        a, b = a[live], b[live]
+        beaten = np.zeros(len(points), bool)
+        beaten[a[rank[b] < rank[a]]] = True
+        winners = (state == 0) & ~beaten
+        state[winners] = 1
+        losers = b[winners[a]]
+        state[losers] = -1
+    return np.flatnonzero(state == 1)
+
+
+def circumspheres(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Centres (T, D), radii (T,) and vertices (T, D + 1) of the Delaunay simplices; the largest empty balls."""
+    from scipy.spatial import Delaunay, QhullError
+
+    try:
+        simplices = Delaunay(points).simplices
+    except QhullError as error:
+        raise ValueError(
+            f"points: {len(points)} particles in {points.shape[1]}D span no simplex (all on one line or plane?)"
+        ) from error
+    corner = points[simplices]
+    edges = corner[:, 1:] - corner[:, :1]
+    volume = np.linalg.det(edges)
+    size = np.prod(np.linalg.norm(edges, axis=2), axis=1)
+    solid = np.abs(volume) > 1e-9 * size  # slivers have no centre to speak of
+    corner, edges = corner[solid], edges[solid]
+    offset = np.linalg.solve(2.0 * edges, np.einsum("tid,tid->ti", edges, edges)[..., None])[..., 0]
+    return corner[:, 0] + offset, np.linalg.norm(offset, axis=1), simplices[solid]
+
+
+def quality(cloud: Cloud, spacing: Any = None) -> Quality:
+    """How evenly the particles of a cloud lie, measured in local spacings so that graded clouds count alike.
+
+    Parameters
+    ----------
+    cloud : a :class:`Cloud`. With normals the boundary is told exactly; without them the domain is taken to be convex.
+    spacing : a number or a function (M, D) -> (M,); by default the mean nearest distance near each particle.
+
+    Returns
+    -------
+    Quality, a named tuple: ``fill`` the radius of the largest empty ball in the domain over the local spacing
+    (0.58 for hexagons), ``separation`` the smallest distance of a pair over the local spacing (1 for any lattice),
+    ``mesh_ratio`` = fill / (separation / 2) (1.15 for hexagons, below 2 is even, above 4 is poor), ``evenness``
+    the least over the mean nearest distance, in local spacings; ``fill_distance`` and ``separation_distance`` the
+    first two in length units (Wendland, Scattered Data Approximation, 2005, has half the latter).
+
+    >>> import jsmitsm as js
+    >>> round(js.quality(js.rectangle((0, 0), (1, 1), (11, 11))).mesh_ratio, 3)
+    1.414
+    """
+    from scipy.spatial import cKDTree
+
+    points = np.asarray(cloud.points)
+    dim = points.shape[1]
+    if len(points) < dim + 2:
+        raise ValueError(f"cloud: {len(points)} particles, at least {dim + 2} are needed to measure how they lie")
+    tree = cKDTree(points)
+    gap, near = tree.query(points, k=min(4 * dim + 1, len(points)))
+    nearest = gap[:, 1]
+    local = nearest[near].mean(axis=1) if spacing is None else spacing_function(spacing)(points)
+    if dim == 1:
+        radii, vertices = np.diff(np.sort(points[:, 0])) / 2, np.argsort(points[:, 0])
+        vertices = np.stack([vertices[:-1], vertices[1:]], axis=1)
+    else:
+        centers, radii, vertices = circumspheres(points)
+        inside = _in_domain(cloud, points, centers)
+        radii, vertices = radii[inside], vertices[inside]
+    fill = float((radii / local[vertices].mean(axis=1)).max())
+    relative = nearest / local
+    return Quality(
+        fill,
+        float(relative.min()),
+        2.0 * fill / float(relative.min()),
+        float(relative.min() / relative.mean()),
+        float(radii.max()),
+        float(nearest.min()),
+    )
+
+
+def _in_domain(cloud: Cloud, points: np.ndarray, centers: np.ndarray) -> np.ndarray:
+    """Whether circumcentres lie in the domain, by the normal of the nearest boundary particle or the convex hull."""
+    from scipy.spatial import Delaunay, cKDTree
+
+    index = np.setdiff1d(np.arange(len(points)), cloud.groups[INTERIOR])
+    if cloud.normals is None or not len(index):
+        return Delaunay(points).find_simplex(centers) >= 0
+    gap, which = cKDTree(points[index]).query(centers)
+    outward = np.asarray(cloud.normals)[index][which]
+    return np.einsum("md,md->m", centers - points[index][which], outward) < 1e-9 * gap

@@ -1,0 +1,190 @@
+"""The solution: values at the particles, local Taylor polynomials, evaluation anywhere."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jsmitsm.boundary import is_traced
+from jsmitsm.clouds import Cloud
+from jsmitsm.moments import derivative_table, monomials
+from jsmitsm.taylor import multi_indices
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How a solution was made, static: enough to fit its local polynomials again."""
+
+    method: str
+    order: int
+    basis_terms: int | None
+    formulation: str
+    fields: int
+
+
+@jax.tree_util.register_pytree_node_class
+class Solution:
+    """A solution at the particles, and anywhere through local Taylor polynomials.
+
+    Attributes
+    ----------
+    u : (N,) values at the particles in the cloud's order, (N, F) for a system.
+    coefficients : (N, K) unscaled Taylor coefficients d^a u / a! at every particle, in the order
+        of :func:`jsmitsm.multi_indices`; (N, K, F) for a system. Fitted when first asked for.
+    converged : whether the solve met its tolerance; iterations : Newton steps (1 if linear).
+    stats : seconds per phase, sizes, what was skipped or repaired.
+
+    ``sol(points)`` evaluates it at points (M, D), ``sol.grad(points)`` its gradient.
+    A solution is a pytree: it passes through ``jax.jit``, ``jax.grad`` and ``pickle``.
+    """
+
+    def __init__(self, values, cloud, recipe, fit, converged, iterations, stats, fitted=None):
+        self._values = values  # (N, F)
+        self.cloud: Cloud = cloud
+        self._recipe: Recipe = recipe
+        self._fit = fit  # a pytree with a method .coefficients(values) and friends
+        self._fitted = fitted  # (N, F, K) or None
+        self.converged = converged
+        self.iterations = iterations
+        self.stats: dict[str, Any] = stats
+
+    @property
+    def method(self) -> str:
+        return self._recipe.method
+
+    @property
+    def order(self) -> int:
+        return self._recipe.order
+
+    @property
+    def u(self) -> Any:
+        return self._values[:, 0] if self._recipe.fields == 1 else self._values
+
+    @property
+    def coefficients(self) -> Any:
+        fitted = self._taylor
+        return fitted[:, 0] if self._recipe.fields == 1 else jnp.swapaxes(fitted, 1, 2)
+
+    @property
+    def _taylor(self) -> Any:
+        """Taylor coefficients (N, F, K)."""
+        if self._fitted is None:
+            fitted = self._fit.coefficients(self._values)
+            if is_traced(fitted):
+                return fitted
+            self._fitted = fitted
+        return self._fitted
+
+    def __call__(self, points: Any, *, blend: bool = False) -> Any:
+        """Values (M,) at ``points`` (M, D), (M, F) for a system.
+
+        Each point takes the polynomial of its nearest particle, or with ``blend`` a smooth average
+        of those of its nearest few, which is continuous across the cloud.
+        """
+        return self.derivative(points, (0,) * self.cloud.dim, blend=blend)
+
+    def grad(self, points: Any, *, blend: bool = False) -> Any:
+        """Gradients (M, D) at ``points`` (M, D), (M, F, D) for a system."""
+        unit = np.eye(self.cloud.dim, dtype=int)
+        return jnp.stack([self.derivative(points, tuple(map(int, b)), blend=blend) for b in unit], axis=-1)
+
+    def derivative(self, points: Any, multi_index: tuple[int, ...], *, blend: bool = False) -> Any:
+        """The derivative d^b u at ``points`` (M, D), |b| at most the order: (M,) or (M, F).
+
+        Blending averages the polynomials' derivatives.
+        """
+        points = _checked_points(points, self.cloud.dim)
+        b = tuple(int(v) for v in multi_index)
+        if len(b) != self.cloud.dim or min(b) < 0 or sum(b) > self.order:
+            raise ValueError(
+                f"multi_index: expected {self.cloud.dim} non-negative orders of sum at most {self.order}, got {multi_index!r}"
+            )
+        near, weight = _nearest(self.cloud.points, points, self.cloud.dim + 2 if blend else 1)
+        values = _evaluate(b, self.order, self.cloud.points, self._taylor, points, near, weight)
+        return values[:, 0] if self._recipe.fields == 1 else values
+
+    def diagnose(self) -> str:
+        """In words: how the solve went, which particles were weak and what was done."""
+        s = self.stats
+        lines = [repr(self)]
+        if not bool(self.converged):
+            lines.append("The solve did NOT converge; do not trust these values.")
+        lines += [str(line) for line in s.get("messages", [])]
+        if "lebesgue_max" in s:
+            lines.append(f"Largest Lebesgue constant {s['lebesgue_max']:.3g} (up to 1.5 is healthy).")
+        if "residual" in s:
+            lines.append(f"Relative residual of the global system {s['residual']:.1e}.")
+        return "\n".join(lines)
+
+    def __repr__(self) -> str:
+        shape = "x".join(map(str, self.u.shape))
+        state = "" if is_traced(self.converged) else f", converged={bool(self.converged)}"
+        return f"Solution(u: {shape}, method={self.method!r}, order={self.order}{state})"
+
+    def tree_flatten(self):
+        return (self._values, self.cloud, self._fit, self._fitted, self.converged, self.iterations), self._recipe
+
+    @classmethod
+    def tree_unflatten(cls, recipe, leaves):
+        new = object.__new__(cls)
+        new._values, new.cloud, new._fit, new._fitted, new.converged, new.iterations = leaves
+        new._recipe = recipe
+        new.stats = {}
+        return new
+
+    def __getstate__(self):
+        # The user's functions need not pickle: what they give, the local polynomials, does.
+        fitted = jax.tree.map(np.asarray, self._taylor)
+        return {**self.__dict__, "_fit": None, "_fitted": fitted}
+
+
+def _checked_points(points: Any, dim: int) -> Any:
+    if not is_traced(points):
+        points = np.asarray(points, dtype=float)
+        if points.ndim == 2 and not np.isfinite(points).all():
+            raise ValueError("points: NaN or infinite coordinates; evaluate at finite points")
+    if points.ndim != 2 or points.shape[1] != dim:
+        raise ValueError(f"points: expected shape (M, {dim}), got {points.shape}; one point is points[None, :]")
+    return points
+
+
+def _nearest(centres: Any, points: Any, count: int) -> tuple[Any, Any]:
+    """The nearest particles (M, count) of each point and their weights, which sum to one."""
+    count = min(count, centres.shape[0])
+    if is_traced(centres, points):
+        square = jnp.sum((jax.lax.stop_gradient(points)[:, None] - jax.lax.stop_gradient(centres)[None]) ** 2, axis=2)
+        index = jax.lax.top_k(-square, count)[1]
+    else:
+        from scipy.spatial import cKDTree
+
+        index = cKDTree(np.asarray(centres)).query(points, k=range(1, count + 1))[1]
+    if count == 1:
+        return index, np.ones(index.shape)
+    xp = jnp if is_traced(centres, points) else np
+    distance = xp.sqrt(xp.sum((points[:, None] - centres[index]) ** 2, axis=2))
+    # The farthest of them gets weight zero, so that none enters or leaves with a jump.
+    weight = xp.maximum(1.0 - distance / distance.max(axis=1, keepdims=True), 0.0) ** 2
+    weight = weight + 1e-300
+    return index, weight / weight.sum(axis=1, keepdims=True)
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _evaluate(b, order, centres, taylor, points, near, weight):
+    """sum_k weight[k] d^b p_k(x): (M, F)."""
+    dim = points.shape[1]
+    lower, factor = derivative_table(dim, order, b)
+    total = 0.0
+    for k in range(near.shape[1]):
+        p = monomials(points - centres[near[:, k]], order)[:, lower] * factor
+        total = total + weight[:, k, None] * jnp.einsum("mfk,mk->mf", taylor[near[:, k]], p)
+    return total
+
+
+def size_of(dim: int, order: int) -> int:
+    """Taylor coefficients of one field."""
+    return len(multi_indices(dim, order))
