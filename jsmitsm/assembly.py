@@ -6,14 +6,15 @@ is fixed by the stencils and known before.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
-from jsmitsm import moments
+from jsmitsm import closure, moments
+from jsmitsm.closure import Recovery
 from jsmitsm.kernels import Kernel
 from jsmitsm.moments import Elimination, Row, Scheme, Support
 from jsmitsm.recursion import row_levels
@@ -110,7 +111,37 @@ def _prepared(scheme, points, kernel, i, near_ids, operands: Operands, jac, own)
 
 
 def _tests(scheme: Scheme, near: Support) -> Any:
-    """Method III tests with kernel derivatives, one for each free coefficient."""
-    if scheme.method != "III":
-        return None
-    raise NotImplementedError
+    return closure.tests_iii(scheme, near) if scheme.method == "III" else None
+
+
+@partial(jax.jit, static_argnums=(0,))
+def recoveries(scheme: Scheme, points: Any, kernel: Kernel, ids: Any, neighbours: Any, operands: Operands) -> Recovery:
+    """Stage 1 of I and II for the particles ``ids``; ``operands.own`` without held values."""
+    TRACES["rows"] += 1
+
+    def particle(i, near_ids, jac, own):
+        near, solution, own, *_ = _prepared(replace(scheme, method=""), points, kernel, i, near_ids, operands, jac, own)
+        return closure.recover(scheme, near, solution, own)
+
+    return _mapped(particle, ids, neighbours, operands)
+
+
+@partial(jax.jit, static_argnums=(0,))
+def closed_rows(
+    scheme: Scheme, points: Any, kernel: Kernel, ids: Any, neighbours: Any, operands: Operands,
+    far_ids: Any, recovered: Recovery, constant: Any,
+) -> tuple[Any, Row]:  # fmt: skip
+    """The rows of I and II over values only, and the neighbours they reach, (n, ns + ns nr)."""
+    TRACES["rows"] += 1
+
+    def particle(i, near_ids, jac, own):
+        near, solution, own, *_ = _prepared(scheme, points, kernel, i, near_ids, operands, jac, own)
+        made = closure.closing(scheme, near, solution, own)
+        reached, weights, more = closure.composed(near_ids, made, far_ids, recovered, constant)
+        size = jnp.sum(jnp.abs(weights))
+        return reached, Row(
+            weights[None, :, None], jnp.zeros((1, reached.shape[0], 0)), made.source[None], made.condition[None],
+            size[None], made.defect, more[None],
+        )  # fmt: skip
+
+    return _mapped(particle, ids, neighbours, operands)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,7 +14,7 @@ from jsmitsm import assembly, moments
 from jsmitsm.assembly import Operands
 from jsmitsm.boundary import Group, group_conditions, is_traced, merged
 from jsmitsm.clouds import Cloud
-from jsmitsm.kernels import Kernel
+from jsmitsm.kernels import Gaussian, Kernel
 from jsmitsm.moments import Elimination, Row, Scheme
 from jsmitsm.neighbours import Stencils, nearest, within
 from jsmitsm.problem import Problem
@@ -88,6 +89,8 @@ def discretize(
         stencils = find_stencils(cloud, kernel, default_size(scheme), scheme_size(scheme))
     elif len(stencils) != len(cloud):
         raise ValueError(f"stencils: built for {len(stencils)} particles, the cloud has {len(cloud)}; build them again")
+    if kernel is None and method in ("I", "II"):
+        kernel = _default_kernel(cloud, stencils)
     disc = Discretization(cloud, kernel, stencils, traced, rec, groups, scheme, [], held, n_own)
     disc.classes = sorted_classes(disc, np.flatnonzero(~held.all(axis=1)), stencils)
     return disc
@@ -191,6 +194,14 @@ def find_stencils(cloud: Cloud, kernel: Kernel | None, size: int, needed: int) -
     return within(points, np.asarray(kernel.d) * np.asarray(kernel.h))
 
 
+def _default_kernel(cloud: Cloud, stencils: Stencils) -> Kernel:
+    """A Gauss function per particle that has fallen to exp(-4) at its farthest neighbour."""
+    near, points = stencils.indices, cloud.points
+    xp = jnp if is_traced(near, points) else np
+    square = xp.sum((points[xp.maximum(near, 0)] - points[:, None]) ** 2, axis=2)
+    return Gaussian(xp.sqrt(xp.max(xp.where(near >= 0, square, 0.0), axis=1)) / 2.0, 2.0)
+
+
 # ------------------------------------------------------------------ numbers
 
 
@@ -220,6 +231,7 @@ def numbers(disc: Discretization, problem: Problem, taylor: Any = None, everywhe
     taylor (N, F, K): the current local expansions, where the problem is nonlinear.
     everywhere: also at particles whose values are held, which carry no equation.
     """
+    everywhere = everywhere or disc.scheme.method in ("I", "II")  # neighbours recover derivatives too
     ids = np.arange(len(disc.cloud)) if everywhere else disc.active
     here = None if taylor is None else taylor[ids]
     jac, source = operator_numbers(disc, problem, disc.cloud.points[ids], here)
@@ -334,6 +346,60 @@ def shared_elimination(disc: Discretization, nums: Numbers) -> Elimination | Non
     return moments.eliminate_on_host(disc.scheme, nums.jac[..., 0])
 
 
+def all_rows(disc: Discretization, nums: Numbers) -> tuple[list[Class], list[Row]]:
+    """The rows of every class, and the classes with the neighbours that the rows reach."""
+    shared = shared_elimination(disc, nums)
+    if disc.scheme.method in ("I", "II"):
+        return _two_stage_rows(disc, nums, shared)
+    return disc.classes, [class_rows(disc, nums, cls, shared) for cls in disc.classes]
+
+
+def _two_stage_rows(disc: Discretization, nums: Numbers, shared: Any) -> tuple[list[Class], list[Row]]:
+    """Methods I and II: recover every particle's coefficients, then insert them into the rows."""
+    wide, far = _recovery_kernel(disc)
+    n_free, rec = len(disc.scheme.free), disc.rec
+    parts, constants, order = [], [], []
+    conditioned = np.zeros(len(disc.cloud), int)
+    for group in disc.groups:
+        conditioned[group.ids] = 0 if group.held else group.n_rows
+    for count in np.unique(conditioned):
+        ids = np.flatnonzero(conditioned == count)
+        cls = Class(ids, far[ids], replace(disc.scheme, n_own=int(count)))
+        given = operands(disc, nums, ids, cls.scheme, shared)
+        made = assembly.recoveries(cls.scheme, disc.cloud.points, wide, ids, cls.neighbours, given)
+        source, values = _right_sides(disc, nums, cls)
+        constants.append(jnp.einsum("nbr,nr->nb", made.source, source) + jnp.einsum("nbk,nk->nb", made.condition, values))
+        parts.append(made._replace(source=jnp.zeros((len(ids), n_free, 0)), condition=jnp.zeros((len(ids), n_free, 0))))
+        order.append(ids)
+    back = np.argsort(np.concatenate(order))
+    recovered = jax.tree.map(lambda *x: jnp.concatenate(x)[back], *parts)
+    constant = jnp.concatenate(constants)[back]
+    classes, rows = [], []
+    for cls in disc.classes:
+        given = operands(disc, nums, cls.ids, cls.scheme, shared)
+        reached, row = assembly.closed_rows(
+            cls.scheme, disc.cloud.points, disc.kernel, cls.ids, cls.neighbours, given, far, recovered, constant
+        )
+        classes.append(replace(cls, neighbours=reached if is_traced(reached) else np.asarray(reached)))
+        rows.append(row)
+    return classes, rows
+
+
+def _recovery_kernel(disc: Discretization) -> tuple[Kernel, Any]:
+    """The kernel of stage 1 and its neighbours: wide enough to hold 1.5 times the free coefficients."""
+    points, kernel, near = disc.cloud.points, disc.kernel, disc.stencils.indices
+    count = math.ceil(1.5 * len(disc.scheme.free)) + 1
+    if is_traced(near, points, kernel):
+        away = jnp.where(near >= 0, jnp.sum((points[jnp.maximum(near, 0)] - points[:, None]) ** 2, axis=2), jnp.inf)
+        reach = jnp.sqrt(jnp.sort(away, axis=1)[:, min(count, near.shape[1]) - 1])
+        reach = jnp.where(jnp.isfinite(reach), reach, 0.0)
+        return kernel.replace(h=jnp.maximum(kernel.h, reach / (0.9 * kernel.d))), near
+    host = np.asarray(points)
+    reach = nearest(host, min(count, len(host))).radius
+    h = np.maximum(np.asarray(kernel.h), reach / (0.9 * np.asarray(kernel.d)))
+    return kernel.replace(h=h), within(host, h * np.asarray(kernel.d)).indices
+
+
 def class_rows(disc: Discretization, nums: Numbers, cls: Class, shared: Any) -> Row:
     """The rows of one class of particles."""
     given = operands(disc, nums, cls.ids, cls.scheme, shared)
@@ -376,11 +442,11 @@ class System:
     n: int
 
 
-def matrix(disc: Discretization, rows: list[Row]) -> tuple[Any, Any, Any]:
+def matrix(disc: Discretization, classes: list[Class], rows: list[Row]) -> tuple[Any, Any, Any]:
     """The global matrix as coordinates: own u_i - sum_g weights u_g over the unknowns."""
     unknown, fields = disc.unknowns, disc.rec.fields
     parts = []
-    for cls, row in zip(disc.classes, rows):
+    for cls, row in zip(classes, rows):
         near, xp = cls.neighbours, np
         if is_traced(near):
             xp = jnp
@@ -406,16 +472,16 @@ def matrix(disc: Discretization, rows: list[Row]) -> tuple[Any, Any, Any]:
     return join(data), (jnp if is_traced(r) else np).concatenate(r), (jnp if is_traced(c) else np).concatenate(c)
 
 
-def right_side(disc: Discretization, nums: Numbers, rows: list[Row]) -> Any:
+def right_side(disc: Discretization, nums: Numbers, classes: list[Class], rows: list[Row]) -> Any:
     """The global right-hand side (n,): source, own conditions and held neighbours."""
     unknown = disc.unknowns
     parts, places = [], []
-    for cls, row in zip(disc.classes, rows):
+    for cls, row in zip(classes, rows):
         xp = jnp if is_traced(nums, row, cls.neighbours) else np
         source, given = _right_sides(disc, nums, cls)
         w, v, v_own = (xp.asarray(x) for x in (row.weights, row.source, row.condition))
         index = xp.maximum(cls.neighbours, 0)
-        total = xp.einsum("nfr,nr->nf", v, source) + xp.einsum("nfk,nk->nf", v_own, given)
+        total = xp.einsum("nfr,nr->nf", v, source) + xp.einsum("nfk,nk->nf", v_own, given) + row.constant
         total = total + xp.einsum("nfgh,ngh->nf", w, xp.asarray(nums.held)[index])
         if disc.scheme.n_data:
             total = total + xp.einsum("nfgd,ngd->nf", xp.asarray(row.data), xp.asarray(nums.gamma)[index])

@@ -38,6 +38,8 @@ from jsmitsm.series import (
 NOTHING, CONSTANT_TERM, EVERYTHING = 0, 1, 2
 # A loop with more operations than this stays a loop in a compiled program.
 UNROLL = 200
+# Bilinear at most: with one series operand they act on each coefficient.
+TERMWISE = {"conv_general_dilated", "fft", "reduce_window_sum", "select_and_gather_add"}
 CALLS = {"jit", "pjit", "closed_call", "core_call", "call", "remat", "checkpoint", "remat2", "custom_vjp_call",
          "custom_vjp_call_jaxpr", "custom_lin"}  # fmt: skip
 
@@ -55,8 +57,10 @@ def called(eqn: Any) -> ClosedJaxpr | None:
 
 def bind(eqn: Any, *args: Any) -> list[Any]:
     """Perform the operation on JAX values."""
-    functions, params = eqn.primitive.get_bind_params(eqn.params)
-    out = eqn.primitive.bind(*functions, *args, **params)
+    params = eqn.primitive.get_bind_params(eqn.params)
+    if isinstance(params, tuple):  # JAX before 0.10: functions come first
+        args, params = (*params[0], *args), params[1]
+    out = eqn.primitive.bind(*args, **params)
     return list(out) if eqn.primitive.multiple_results else [out]
 
 
@@ -136,9 +140,19 @@ def _apply(ring: Ring, eqn: Any, vals: list[Any], linear: bool) -> list[Array]:
     active = [v for v in vals if v.shape[0] > 1]
     if not active:
         return [plain_elementwise(eqn, vals)] if name in ELEMENTWISE else _plain_any(eqn, vals)
+    if name in TERMWISE and len(active) == 1:
+        return _termwise(eqn, vals)
     if linear:
         raise _unsupported(name)
     return _by_derivative(ring, eqn, vals)
+
+
+def _termwise(eqn: Any, vals: list[Array]) -> list[Array]:
+    """A primitive linear in its one series operand: coefficient by coefficient."""
+    (active,) = [k for k, v in enumerate(vals) if v.shape[0] > 1]
+    terms = [_plain_any(eqn, [v[j:j + 1] if k == active else v for k, v in enumerate(vals)])
+             for j in range(vals[active].shape[0])]  # fmt: skip
+    return [xp_of(*parts).concatenate(parts) for parts in zip(*terms, strict=True)]
 
 
 def _unsupported(name: str, why: str = "") -> ValueError:

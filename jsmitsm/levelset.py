@@ -380,24 +380,35 @@ def _jumps(region: SdfRegion, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray,
 
 def _surface(region: SdfRegion, spacing: Spacing, seed: int) -> Boundary:
     """The zero level in 3D: foot points of small cells, thinned, relaxed on the surface, holes filled."""
-    cells, _ = _cells(region, spacing, 0.6)
-    close = np.abs(cells.distance) < np.sqrt(3) * cells.widths
+    cells, _ = _cells(region, spacing, 0.5)
+    close = np.abs(cells.distance) < 0.6 * cells.widths  # about one foot per cell that the surface cuts
     feet, arrived = region.project(cells.centers[close], cells.widths[close])
     arrived &= np.linalg.norm(feet - cells.centers[close], axis=1) < 2 * cells.widths[close]
-    feet = feet[arrived]
-    feet = feet[_crossing(region, feet)]
+    feet, area = feet[arrived], cells.widths[close][arrived] ** 2 / 1.2  # volume of the layer over its thickness
+    crossing = _crossing(region, feet)
+    feet, area = feet[crossing], area[crossing]
     if not len(feet):
         raise ValueError("spacing: too coarse for the shape, no boundary was found; reduce it below the shape's width")
     h = spacing(feet)
-    rng = np.random.default_rng(seed)
-    # Random thinning to 0.78 spacings leaves as many points as hexagons of one spacing have.
-    points = feet[packing.thin(feet, 0.78 * h, rng.permutation(len(feet)))]
+    points = _sparse(feet, h, float((area / h**2).sum()), seed)
     _check_components(feet, h, points)
     points = _relax_surface(region, points, spacing, 30)
     points = _refill(points, feet, h)
     points = _relax_surface(region, points, spacing, 15)
     points = points[packing.thin(points, 0.5 * spacing(points), np.arange(len(points)))]
     return Boundary(points, _surface_normals(region, points, spacing(points)))
+
+
+def _sparse(feet: np.ndarray, h: np.ndarray, area: float, seed: int) -> np.ndarray:
+    """A random even choice of feet, as many as hexagons of one spacing cover ``area`` (in squared spacings)."""
+    priority = np.random.default_rng(seed).permutation(len(feet))
+    radius, wanted = 0.78, 2.0 / np.sqrt(3.0) * area
+    for _ in range(4):
+        chosen = packing.thin(feet, radius * h, priority)
+        if abs(len(chosen) - wanted) < 0.02 * wanted:
+            break
+        radius *= np.clip(np.sqrt(len(chosen) / wanted), 0.7, 1.2)
+    return feet[chosen]
 
 
 def _crossing(region: SdfRegion, x: np.ndarray) -> np.ndarray:

@@ -23,8 +23,8 @@ import numpy as np
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
-from .errors import SolveError
-from .sparse import (
+from jsmitsm.errors import SolveError
+from jsmitsm.sparse import (
     COUNTS,
     DENSE_MAX,
     Factor,
@@ -101,10 +101,10 @@ def solve(
     if isinstance(points, jax.core.Tracer):
         points = None
     points = _check(data, rows, cols, b, n, points, solver)
-    dtype = jnp.result_type(data, b, jnp.float32)
+    dtype = jnp.result_type(data, b, float)
     if not traced:
         _refuse_nonfinite(np.asarray(b))
-        found, cached = _lookup(data, rows, cols, _Settings(n, points, solver, elliptic, refine))
+        found, cached = _lookup((data, rows, cols), _Settings(n, points, solver, elliptic, refine))
         x = found.solve(b)
         if info is not None:
             info.update(found.info, cached=cached)
@@ -218,7 +218,7 @@ def _same(a: Any, b: Any) -> bool:
 class _Entry:
     """A kept factorisation and the arrays it was made of."""
 
-    arrays: tuple[Any, Any, Any]
+    arrays: tuple[Any, ...]
     settings: _Settings
     factor: Factor
 
@@ -251,7 +251,7 @@ def factor(
       True
     """
     points = _check(data, rows, cols, np.zeros(n), n, points, solver)
-    return _lookup(data, rows, cols, _Settings(n, points, solver, elliptic, refine))[0]
+    return _lookup((data, rows, cols), _Settings(n, points, solver, elliptic, refine))[0]
 
 
 def clear_cache() -> None:
@@ -265,20 +265,20 @@ def factorisations() -> int:
     return COUNTS["factorisations"]
 
 
-def _lookup(data: Any, rows: Any, cols: Any, settings: _Settings) -> tuple[Factor, bool]:
-    """The factorisation of these entries, and whether it was kept."""
-    arrays = (data, rows, cols)
+def _lookup(arrays: Sequence[Any], settings: _Settings) -> tuple[Factor, bool]:
+    """The factorisation of (data, rows, cols), and whether it was kept."""
     with _lock:
         for k in range(len(_cache) - 1, -1, -1):
             if _cache[k].matches(arrays, settings):
                 _cache.append(_cache.pop(k))
                 return _cache[-1].factor, True
     s = settings
+    data, rows, cols = arrays
     made = Factor(data, rows, cols, s.n, s.points, s.solver, s.elliptic, s.refine)
     # A numpy array may be changed in place after this call; a JAX array cannot.
     kept = tuple(a if isinstance(a, jax.Array) else np.array(a) for a in arrays)
     with _lock:
-        _cache.append(_Entry(kept, settings, made))  # type: ignore[arg-type]
+        _cache.append(_Entry(kept, settings, made))
         total = sum(entry.factor.nbytes for entry in _cache)
         while len(_cache) > 1 and (len(_cache) > CACHE_ENTRIES or total > CACHE_BYTES):
             total -= _cache.pop(0).factor.nbytes
@@ -297,21 +297,20 @@ def _batched(data: Any, rows: Any, cols: Any) -> bool:
     return max(data.ndim, rows.ndim, cols.ndim) > 1
 
 
-def _on_host(data: Any, rows: Any, cols: Any, b: Any, settings: _Settings, transpose: bool) -> Any:
+def _on_host(arrays: Sequence[Any], b: Any, settings: _Settings, transpose: bool) -> np.ndarray:
     """Solve concrete arrays, batch element by batch element."""
-    if not _batched(data, rows, cols):
-        x = _lookup(data, rows, cols, settings)[0].solve(b, transpose)
-        return x.astype(b.dtype)
+    if not _batched(*arrays):
+        return _lookup(arrays, settings)[0].solve(b, transpose).astype(b.dtype)
+    arrays, b = [np.asarray(a) for a in arrays], np.asarray(b)
     out = np.empty(b.shape, b.dtype)
-    arrays = [np.asarray(a) for a in (data, rows, cols)]
     for k in range(b.shape[0]):
         one = [a[k] if a.ndim > 1 else a for a in arrays]
-        out[k] = _lookup(*one, settings)[0].solve(np.asarray(b[k]), transpose)
+        out[k] = _lookup(one, settings)[0].solve(b[k], transpose)
     return out
 
 
 def _impl(data: Any, rows: Any, cols: Any, b: Any, *, settings: _Settings, transpose: bool) -> Any:
-    return jnp.asarray(_on_host(data, rows, cols, b, settings, transpose))
+    return jnp.asarray(_on_host((data, rows, cols), b, settings, transpose))
 
 
 def _jvp(primals: Any, tangents: Any, *, settings: _Settings, transpose: bool) -> Any:
@@ -344,17 +343,17 @@ def _transpose(
 
 def _batch(args: Any, axes: Any, *, settings: _Settings, transpose: bool) -> Any:
     """Several right-hand sides are one wide one; several matrices are solved in turn."""
-    size = next(a.shape[k] for a, k in zip(args, axes) if k is not batching.not_mapped)
+    size = next(a.shape[k] for a, k in zip(args, axes) if k is not None)
     bind = partial(solve_p.bind, settings=settings, transpose=transpose)
     data, rows, cols, b = args
-    if all(k is batching.not_mapped for k in axes[:3]):
+    if all(k is None for k in axes[:3]):
         b = jnp.moveaxis(b, axes[3], -2)
         x = bind(data, rows, cols, b.reshape(*b.shape[:-2], -1))
         return x.reshape(b.shape), b.ndim - 2
     front = [
-        a if k is batching.not_mapped else jnp.moveaxis(a, k, 0) for a, k in zip(args, axes)
+        a if k is None else jnp.moveaxis(a, k, 0) for a, k in zip(args, axes)
     ]
-    mapped = [k is not batching.not_mapped for k in axes]
+    mapped = [k is not None for k in axes]
     core = (1, 1, 1, 2)  # axes of an operand without any batch
     inner = max(a.ndim - m - c for a, m, c in zip(front, mapped, core))  # an older batch axis
     depth = next((a.shape[m] for a, m, c in zip(front, mapped, core) if a.ndim - m > c), 1)
@@ -399,7 +398,7 @@ def _lower(
 
     def call(*args: np.ndarray) -> tuple[np.ndarray]:
         try:
-            return (_on_host(*args, settings=settings, transpose=transpose),)
+            return (_on_host(args[:3], args[3], settings, transpose),)
         except SolveError:  # an exception would tear down the whole program
             return (np.full(aval.shape, np.nan, aval.dtype),)
 

@@ -6,9 +6,7 @@ s = (x_g - x_i) / l, scaled by a length l of the support, so nothing here knows 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any, NamedTuple
 
 import jax
@@ -16,8 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm.kernels import EDGE, Gaussian, Kernel
-from jsmitsm.recursion import Recursion, Slot, constraints, general_inverse, null_space, substitution
-from jsmitsm.taylor import factorial, index_of, multi_indices
+from jsmitsm.polynomials import functionals, monomials, whitening
+from jsmitsm.recursion import Recursion, Slot, constraints, substitution
+from jsmitsm.smallsolve import general_inverse, gram_inverse, min_norm, null_space, solve_gram
+from jsmitsm.taylor import multi_indices
 
 
 @dataclass(frozen=True)
@@ -62,6 +62,7 @@ class Row(NamedTuple):
     condition: Any  # (F, n_own)
     lebesgue: Any  # (F,)
     defect: Any  # (), how far the moment system is from determining what was asked
+    constant: Any  # (F,) a further part of the right-hand side (I and II)
 
 
 class Support(NamedTuple):
@@ -94,136 +95,6 @@ def support(points: Any, i: Any, neighbours: Any, kernel: Kernel | None) -> Supp
 def _default_kernel(distance: Any) -> Kernel:
     """A Gauss function that has fallen to exp(-4) at the farthest neighbour."""
     return Gaussian.tree_unflatten(None, (jnp.max(distance) / 2.0, 2.0, None))
-
-
-# ------------------------------------------------------------ polynomials
-
-
-@lru_cache(maxsize=32)
-def _monomial_steps(dim: int, order: int) -> list[tuple[int, int, int]]:
-    """Blocks (source prefix, axis, how many) that build each degree from the one before."""
-    indices, place = multi_indices(dim, order), index_of(dim, order)
-    steps = []
-    for k, a in enumerate(indices[1:], start=1):
-        axis = next(j for j in range(dim) if a[j])
-        lower = tuple(v - (j == axis) for j, v in enumerate(a))
-        steps.append((k, place[lower], axis))
-    return steps
-
-
-def monomials(offset: Any, order: int) -> Any:
-    """All monomials s^a with |a| <= order: (ns, D) -> (ns, K)."""
-    columns = [jnp.ones_like(offset[:, 0])]
-    for _, lower, axis in _monomial_steps(offset.shape[1], order):
-        columns.append(columns[lower] * offset[:, axis])
-    return jnp.stack(columns, axis=1)
-
-
-@lru_cache(maxsize=256)
-def derivative_table(dim: int, order: int, b: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """d^b s^a = factor[a] s^(a-b): the place of a - b (0 where the factor is 0), and the factor."""
-    place = index_of(dim, order)
-    lower = [tuple(ai - bi for ai, bi in zip(a, b)) for a in place]
-    ok = [min(c) >= 0 for c in lower]
-    return (
-        np.array([place[c] if good else 0 for c, good in zip(lower, ok)]),
-        np.array([factorial(a) / factorial(c) if good else 0.0 for a, c, good in zip(place, lower, ok)]),
-    )
-
-
-def functionals(slots: Sequence[Slot], coef: Any, p: Any, rec: Recursion, length: Any) -> tuple[Any, Any]:
-    """Rows (n, F K) of conditions sum_s coef[n, s] d^b u_f at a point with monomials p (K,).
-
-    Each row is scaled to be free of units and of unit size at the leading term; the second
-    result holds the factors (n,) of the right-hand side.
-    """
-    rows = jnp.zeros((coef.shape[0], rec.fields * rec.size), p.dtype)
-    for s, (f, b) in enumerate(slots):
-        lower, factor = derivative_table(rec.dim, rec.order, b)
-        row = p[lower] * factor * length ** (-sum(b) - rec.weights[f])
-        rows = rows.at[:, f * rec.size : (f + 1) * rec.size].add(coef[:, s, None] * row)
-    sizes = jnp.stack([jnp.abs(coef[:, s]) * length ** (-sum(b) - rec.weights[f]) for s, (f, b) in enumerate(slots)])
-    size = jnp.max(sizes, axis=0)
-    scale = 1.0 / jnp.where(size > 0, size, 1.0)
-    return rows * scale[:, None], scale
-
-
-@lru_cache(maxsize=32)
-def whitening(dim: int, order: int) -> np.ndarray:
-    """A triangular T (K, K): the polynomials s^a T are orthonormal over the unit ball under the
-    default weight, so that normal equations of the moment systems are safe."""
-    nodes, weights = np.polynomial.legendre.leggauss(order + 12)
-    grid = np.stack(np.meshgrid(*[nodes] * dim, indexing="ij"), axis=-1).reshape(-1, dim)
-    mass = np.prod(np.stack(np.meshgrid(*[weights] * dim, indexing="ij"), axis=-1).reshape(-1, dim), axis=1)
-    inside = (grid**2).sum(axis=1) <= 1
-    grid, mass = grid[inside], mass[inside]
-    root = np.sqrt(mass / mass.sum() * np.exp(-4 * (grid**2).sum(axis=1)))
-    p = np.stack([np.prod(grid ** np.array(a), axis=1) for a in multi_indices(dim, order)], axis=1)
-    r = np.linalg.qr(root[:, None] * p, mode="r")
-    return np.linalg.inv(r * np.sign(np.diag(r))[:, None])
-
-
-# ------------------------------------------------------------ small systems
-
-
-def gram_inverse(a: Any, tolerance: float | None = None) -> Any:
-    """(A^T A)^-1 for a tall A (n, k) by symmetric sweeps; with a tolerance, columns that depend
-    on others up to it are left out (zero rows and columns)."""
-    size = jnp.sqrt(jnp.sum(a**2, axis=0))
-    scale = 1.0 / jnp.where(size > 0, size, 1.0)
-    gram = (a * scale).T @ (a * scale)
-    k = gram.shape[0]
-
-    def sweep(g, j, keep):
-        row = g[j]
-        pivot = jnp.where(keep, row[j], 1.0)
-        swept = g - jnp.outer(row, row / pivot)
-        swept = swept.at[j].set(row / pivot).at[:, j].set(row / pivot).at[j, j].set(-1.0 / pivot)
-        return jnp.where(keep, swept, g)
-
-    if tolerance is None:
-        inverse = -jax.lax.fori_loop(0, k, lambda j, g: sweep(g, j, True), gram)
-    else:
-
-        def pivoted(_, carry):
-            g, done = carry
-            rest = jnp.where(done, -1.0, jnp.diagonal(g))
-            j = jnp.argmax(rest)
-            keep = rest[j] > tolerance
-            return sweep(g, j, keep), done.at[j].set(done[j] | keep)
-
-        g, done = jax.lax.fori_loop(0, k, pivoted, (gram, jnp.zeros(k, bool)))
-        inverse = jnp.where(done[:, None] & done[None, :], -g, 0.0)
-    return inverse * scale[:, None] * scale[None, :]
-
-
-def min_norm(a: Any, t: Any, tolerance: float | None = None) -> Any:
-    """The smallest w (n, m) with A^T w = t, for A (n, k) and t (k, m); refined once."""
-    return _min_norm(tolerance, a, t)[0]
-
-
-def _solve_gram(a: Any, inverse: Any, t: Any) -> Any:
-    y = inverse @ t
-    return y + inverse @ (t - a.T @ (a @ y))
-
-
-def _min_norm_impl(tolerance, a, t):
-    inverse = gram_inverse(a, tolerance)
-    y = _solve_gram(a, inverse, t)
-    return a @ y, y
-
-
-_min_norm = jax.custom_jvp(_min_norm_impl, nondiff_argnums=(0,))
-
-
-@_min_norm.defjvp
-def _min_norm_jvp(tolerance, primals, tangents):
-    # w = A y and A^T w = t, so dw = dA y + A dy with A^T A dy = dt - dA^T w - A^T dA y.
-    (a, t), (da, dt) = primals, tangents
-    w, y = _min_norm(tolerance, a, t)
-    day = da @ y
-    dy = _solve_gram(a, gram_inverse(a, tolerance), dt - da.T @ w - a.T @ day)
-    return (w, y), (day + a @ dy, dy)
 
 
 # ------------------------------------------------------------ the methods
@@ -278,10 +149,10 @@ def _all_free(scheme: Scheme) -> np.ndarray:
     return np.setdiff1d(np.arange(scheme.rec.size), scheme.dependent)
 
 
-def _fit(scheme: Scheme, near: Support, phi: Any, tests: Any, target: Any) -> Any:
+def _fit(scheme: Scheme, weight: Any, phi: Any, tests: Any, target: Any) -> Any:
     """Weights w (n, m) on the data with phi^T w = target, in the method's test space."""
     if tests is None:
-        root = jnp.sqrt(near)[:, None]
+        root = jnp.sqrt(weight)[:, None]
         tolerance = 1e-13 if scheme.method == "SSPH" else None
         return root * min_norm(root * phi, target, tolerance)
     return tests @ (general_inverse(phi.T @ tests) @ target)
@@ -303,19 +174,22 @@ class System(NamedTuple):
 
 
 def local_system(
-    scheme: Scheme, near: Support, solution: Elimination, own: Any, data: Any, derivatives: Any, skip_self: bool
-) -> System:
+    scheme: Scheme, near: Support, solution: Elimination, own: Any, data: Any, tests: Any, skip_self: bool,
+    values: Any = None,
+) -> System:  # fmt: skip
     """Set up the moment system of one particle.
 
     own (n_own, S_own): coefficients of its own conditions, imposed exactly; data
     (ns, n_data, S_data): coefficients of its neighbours' conditions, fitted like values;
-    derivatives (ns, free): kernel derivatives for the tests of III.
+    tests (rows of data, free): what the rows of I, II and III are multiplied with; values
+    (rows of data, F K): what the data are, the neighbours' values if not given.
     """
     rec = scheme.rec
     p = monomials(near.offset, rec.order)
     ns, fields = p.shape[0], rec.fields
     weight = near.weight.at[0].set(0.0) if skip_self else near.weight
-    values = jnp.einsum("gk,fh->gfhk", p, jnp.eye(fields)).reshape(ns * fields, -1) if fields > 1 else p
+    if values is None:
+        values = jnp.einsum("gk,fh->gfhk", p, jnp.eye(fields)).reshape(ns * fields, -1) if fields > 1 else p
     weights = jnp.repeat(weight, fields)
     data_scale = jnp.zeros((ns, 0))
     if scheme.n_data:
@@ -331,10 +205,10 @@ def local_system(
         own_rows, own_scale = functionals(scheme.own, own, at, rec, near.length)
         z, own_solve = null_space(own_rows @ basis)
         basis = basis @ z
-        derivatives = None if derivatives is None else derivatives @ z
+        tests = None if tests is None else tests @ z
     phi = values @ basis
     return System(
-        solution, basis, own_rows, own_scale, own_solve, values, phi, weights, derivatives, data_scale
+        solution, basis, own_rows, own_scale, own_solve, values, phi, weights, tests, data_scale
     )
 
 
@@ -353,10 +227,10 @@ def functional(scheme: Scheme, near: Support, system: System, wanted: Any) -> tu
     return w, v, v_own, defect
 
 
-def row(scheme: Scheme, near: Support, solution: Elimination, own: Any, data: Any, derivatives: Any) -> Row:
+def row(scheme: Scheme, near: Support, solution: Elimination, own: Any, data: Any, tests: Any) -> Row:
     """The particle's equations in the global system."""
     make = _collocated if scheme.method == "SSPH" else _predicted
-    w, v, v_own, lebesgue, defect, system = make(scheme, near, solution, own, data, derivatives)
+    w, v, v_own, lebesgue, defect, system = make(scheme, near, solution, own, data, tests)
     rec, ns = scheme.rec, near.weight.shape[0]
     fields = rec.fields
     # Fields are balanced by powers of the length inside the fit; the global unknowns are not.
@@ -364,13 +238,13 @@ def row(scheme: Scheme, near: Support, solution: Elimination, own: Any, data: An
     lift = jnp.ones(fields) if scheme.method == "SSPH" else 1.0 / power
     values = w[: ns * fields].T.reshape(fields, ns, fields) * power * lift[:, None, None]
     extra = w[ns * fields :].T.reshape(fields, ns, scheme.n_data) * system.data_scale * lift[:, None, None]
-    return Row(values, extra, v.T * lift[:, None], v_own.T * lift[:, None], lebesgue, defect)
+    return Row(values, extra, v.T * lift[:, None], v_own.T * lift[:, None], lebesgue, defect, jnp.zeros(fields))
 
 
-def _predicted(scheme, near, solution, own, data, derivatives):
+def _predicted(scheme, near, solution, own, data, tests):
     """u_i = U_i(0): the particle's value as its neighbours predict it."""
     rec = scheme.rec
-    system = local_system(scheme, near, solution, own, data, derivatives, skip_self=True)
+    system = local_system(scheme, near, solution, own, data, tests, skip_self=True)
     wanted = np.zeros((rec.fields, rec.fields * rec.size))
     wanted[np.arange(rec.fields), np.arange(rec.fields) * rec.size] = 1.0
     w, v, v_own, defect = functional(scheme, near, system, jnp.asarray(wanted))
@@ -378,10 +252,10 @@ def _predicted(scheme, near, solution, own, data, derivatives):
     return w, v * solution.lift[:, None], v_own * system.own_scale[:, None], lebesgue, defect, system
 
 
-def _collocated(scheme, near, solution, own, data, derivatives):
+def _collocated(scheme, near, solution, own, data, tests):
     """The equation itself, or the particle's own boundary condition, applied to the fit (SSPH)."""
     rec = scheme.rec
-    system = local_system(scheme, near, solution, own, data, derivatives, skip_self=False)
+    system = local_system(scheme, near, solution, own, data, tests, skip_self=False)
     at = np.array(rec.equation_rows)
     wanted, v = solution.rows, jnp.zeros((rec.n_rows, rec.fields)).at[at, np.arange(rec.fields)].set(solution.lift[at])
     v_own = jnp.zeros((0, rec.fields))
@@ -396,7 +270,7 @@ def _collocated(scheme, near, solution, own, data, derivatives):
 
 
 def coefficients(
-    scheme: Scheme, near: Support, solution: Elimination, own: Any, data: Any, derivatives: Any,
+    scheme: Scheme, near: Support, solution: Elimination, own: Any, data: Any, tests: Any,
     values: Any, source: Any, given: Any,
 ) -> Any:  # fmt: skip
     """The particle's Taylor coefficients (F, K), unscaled, from its neighbours' values.
@@ -406,7 +280,7 @@ def coefficients(
     """
     rec, fields = scheme.rec, scheme.rec.fields
     collocated = scheme.method == "SSPH"
-    system = local_system(scheme, near, solution, own, data, derivatives, skip_self=not collocated)
+    system = local_system(scheme, near, solution, own, data, tests, skip_self=not collocated)
     ns = near.weight.shape[0]
     power = near.length ** jnp.asarray(rec.weights, near.length.dtype)
     given = jnp.zeros(0) if given is None else given
@@ -420,7 +294,7 @@ def coefficients(
     if system.tests is None:
         a = jnp.sqrt(system.weight)[:, None] * system.phi
         inverse = gram_inverse(a, 1e-13 if collocated else None)
-        free = _solve_gram(a, inverse, a.T @ (jnp.sqrt(system.weight) * rest))
+        free = solve_gram(a, inverse, a.T @ (jnp.sqrt(system.weight) * rest))
     else:
         free = general_inverse(system.tests.T @ system.phi) @ (system.tests.T @ rest)
     scaled_u = (part + system.reduced @ free).reshape(fields, rec.size)

@@ -25,6 +25,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jsmitsm.smallsolve import general_inverse
 from jsmitsm.taylor import factorial, index_of, multi_indices
 
 Slot = tuple[int, tuple[int, ...]]
@@ -168,53 +169,6 @@ def source_rows(rec: Recursion, residual: Any) -> Any:
 # ---------------------------------------------------------------- elimination
 
 
-@jax.custom_jvp
-def null_space(matrix: Any) -> tuple[Any, Any]:
-    """Orthonormal basis Z of the null space of C (r, k), and the pseudo-inverse Q of C (full rank).
-
-    Householder reflections in plain jnp, so that it batches without LAPACK.
-    """
-    r, k = matrix.shape
-    if r == 0:
-        return jnp.eye(k, dtype=matrix.dtype), jnp.zeros((k, 0), matrix.dtype)
-
-    def reflect(j, carry):
-        x, q = carry
-        column = jnp.where(jnp.arange(k) >= j, x[:, j], 0.0)
-        length = jnp.sqrt(jnp.sum(column**2))
-        pivot = column[j]
-        v = column.at[j].add(jnp.where(pivot >= 0, length, -length))
-        beta = jnp.sum(v**2)
-        v = v * jnp.sqrt(2.0 / jnp.where(beta > 0, beta, 1.0))
-        return x - jnp.outer(v, v @ x), q - jnp.outer(q @ v, v)
-
-    x, q = jax.lax.fori_loop(0, r, reflect, (matrix.T, jnp.eye(k, dtype=matrix.dtype)))
-    return q[:, r:], q[:, :r] @ _inverse_lower(x[:r].T)
-
-
-@null_space.defjvp
-def _null_space_jvp(primals, tangents):
-    # C Z = 0 gives dZ = -Q dC Z up to a rotation of Z, on which nothing that is used depends.
-    (matrix,), (change,) = primals, tangents
-    z, q = null_space(matrix)
-    dz = -q @ (change @ z)
-    dq = z @ ((change @ z).T @ (q.T @ q)) - q @ (change @ q)
-    return (z, q), (dz, dq)
-
-
-def _inverse_lower(lower: Any) -> Any:
-    """The inverse of a lower triangular matrix by forward substitution; zero pivots give zero rows."""
-    n = lower.shape[0]
-
-    def step(i, inverse):
-        row = jnp.where(jnp.arange(n) < i, lower[i], 0.0)
-        pivot = lower[i, i]
-        safe = jnp.where(jnp.abs(pivot) > 1e-13, pivot, jnp.inf)
-        return inverse.at[i].set((jnp.eye(n, dtype=lower.dtype)[i] - row @ inverse) / safe)
-
-    return jax.lax.fori_loop(0, n, step, jnp.zeros_like(lower))
-
-
 def free_indices(rec: Recursion, jac0: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The paper's choice of free and dependent Taylor coefficients (positions in 0..K-1).
 
@@ -254,26 +208,3 @@ def substitution(matrix: Any, free: np.ndarray, dependent: np.ndarray) -> tuple[
     if len(dependent) == 0:
         return jnp.eye(matrix.shape[1], dtype=matrix.dtype), jnp.zeros((matrix.shape[1], 0), matrix.dtype)
     return _substitute(matrix, tuple(int(i) for i in free), tuple(int(i) for i in dependent))
-
-
-@jax.custom_jvp
-def general_inverse(matrix: Any) -> Any:
-    """The inverse of a small square matrix: Gauss-Jordan with row pivoting in plain jnp."""
-    n = matrix.shape[0]
-    work = jnp.concatenate([matrix, jnp.eye(n, dtype=matrix.dtype)], axis=1)
-
-    def step(k, work):
-        pivot = jnp.argmax(jnp.where(jnp.arange(n) >= k, jnp.abs(work[:, k]), -1.0))
-        row, other = work[pivot], work[k]
-        work = work.at[pivot].set(other)
-        row = row / row[k]
-        column = work[:, k].at[k].set(0.0)
-        return (work - jnp.outer(column, row)).at[k].set(row)
-
-    return jax.lax.fori_loop(0, n, step, work)[:, n:]
-
-
-@general_inverse.defjvp
-def _general_inverse_jvp(primals, tangents):
-    inverse = general_inverse(primals[0])
-    return inverse, -inverse @ (tangents[0] @ inverse)

@@ -12,7 +12,7 @@ import numpy as np
 
 from jsmitsm.boundary import is_traced
 from jsmitsm.clouds import Cloud
-from jsmitsm.moments import derivative_table, monomials
+from jsmitsm.polynomials import derivative_table, monomials
 from jsmitsm.taylor import multi_indices
 
 

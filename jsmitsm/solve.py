@@ -141,11 +141,10 @@ def _linear_step(disc: Discretization, nums: Numbers, solver: str, stats: dict, 
     """Assemble and solve one linear system: values (N, F) and whether it went well."""
     clock = time.perf_counter
     t0 = clock()
-    shared = dz.shared_elimination(disc, nums)
-    rows = [dz.class_rows(disc, nums, c, shared) for c in disc.classes]
+    classes, rows = dz.all_rows(disc, nums)
     t1 = clock()
-    data, r, c = dz.matrix(disc, rows)
-    b = dz.right_side(disc, nums, rows)
+    data, r, c = dz.matrix(disc, classes, rows)
+    b = dz.right_side(disc, nums, classes, rows)
     t2 = clock()
     info: dict[str, Any] = {}
     x = linsolve.solve(data, r, c, b, n=b.shape[0], solver=solver, info=info)

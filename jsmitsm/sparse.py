@@ -15,12 +15,12 @@ from typing import Any
 
 import numpy as np
 
-from .backends import BACKENDS, ITERATIVE, SuperLU, installed
-from .errors import SolveError
-from .ordering import nested_dissection
+from jsmitsm.backends import BACKENDS, ITERATIVE, SuperLU, installed
+from jsmitsm.errors import SolveError
+from jsmitsm.ordering import nested_dissection
 
 DENSE_MAX = 300  # unknowns: below, LAPACK beats every sparse code
-ITERATIVE_MIN = {1: None, 2: 80_000, 3: 6_000}  # measured: multigrid overtakes the direct solver
+ITERATIVE_MIN = {1: None, 2: 200_000, 3: 6_000}  # measured: multigrid overtakes the direct solver
 BACKWARD_ERROR = 1e-9  # what is accepted of a direct solver
 BACKWARD_ERROR_ITERATIVE = 1e-12  # of an iterative one, which reaches round-off unless it stalls
 SINGULAR = 1e15  # condition number (scaled) above which no digit of a solution means anything
@@ -293,8 +293,6 @@ def choose_backends(
     """Backends to be tried in turn."""
     # Without coordinates there is no good order, so the direct solver finds its own.
     direct = ["colamd"] if points is None or n <= DENSE_MAX else ["nested dissection", "colamd"]
-    if installed("pypardiso") and n > DENSE_MAX:
-        direct.insert(0, "pardiso")
     if solver == "dense" or (solver == "auto" and n <= DENSE_MAX):
         return ["lapack"]
     if solver == "sparse":

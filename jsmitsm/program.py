@@ -1,0 +1,66 @@
+"""Compiled programs, kept under what they compute."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
+
+_KEPT = 256
+_programs: OrderedDict[Any, Any] = OrderedDict()
+
+
+def kept(key: Any, make: Callable[[], Any]) -> Any:
+    """The program of this key, made when first asked for; the longest unused are dropped."""
+    if key not in _programs:
+        _programs[key] = make()
+        if len(_programs) > _KEPT:
+            _programs.popitem(last=False)
+    _programs.move_to_end(key)
+    return _programs[key]
+
+
+def fingerprint(jaxpr: Jaxpr) -> Any:
+    """A hashable value, equal for jaxprs that compute the same in the same way."""
+    number: dict[Any, int] = {}
+
+    def name(v: Any) -> Any:
+        if isinstance(v, Literal):
+            value = np.asarray(v.val, v.aval.dtype)
+            return value.dtype.str, value.tobytes()
+        return number.setdefault(v, len(number))
+
+    def declare(variables: Any) -> Any:
+        return tuple((name(v), v.aval.shape, v.aval.dtype.name) for v in variables)
+
+    head = declare(jaxpr.constvars), declare(jaxpr.invars)
+    body = tuple(
+        (eqn.primitive.name, tuple(map(name, eqn.invars)), declare(eqn.outvars), _parameters(eqn.params))
+        for eqn in jaxpr.eqns
+    )
+    return head, body, tuple(map(name, jaxpr.outvars))
+
+
+def _parameters(value: Any) -> Any:
+    if isinstance(value, ClosedJaxpr):
+        return fingerprint(value.jaxpr), tuple(map(_parameters, value.consts))
+    if isinstance(value, Jaxpr):
+        return fingerprint(value)
+    if isinstance(value, dict):
+        return tuple((k, _parameters(value[k])) for k in sorted(value))
+    if isinstance(value, tuple | list):
+        return tuple(map(_parameters, value))
+    if isinstance(value, jax.core.Tracer):
+        return id(value)
+    if isinstance(value, np.ndarray | jax.Array):
+        value = np.asarray(value)
+        return value.dtype.str, value.shape, value.tobytes()
+    try:
+        hash(value)
+    except TypeError:
+        return repr(value)
+    return value

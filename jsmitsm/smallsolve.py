@@ -1,0 +1,142 @@
+"""Small dense systems in plain jnp: they batch, differentiate and never call LAPACK.
+
+Batched LAPACK calls that run side by side in one program can deadlock on a small machine, and
+do not run on every device; loops of rank-one updates do, and are faster at these sizes.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+
+@jax.custom_jvp
+def null_space(matrix: Any) -> tuple[Any, Any]:
+    """Orthonormal basis Z of the null space of C (r, k), and the pseudo-inverse Q of C (full rank).
+
+    Householder reflections in plain jnp, so that it batches without LAPACK.
+    """
+    r, k = matrix.shape
+    if r == 0:
+        return jnp.eye(k, dtype=matrix.dtype), jnp.zeros((k, 0), matrix.dtype)
+
+    def reflect(j, carry):
+        x, q = carry
+        column = jnp.where(jnp.arange(k) >= j, x[:, j], 0.0)
+        length = jnp.sqrt(jnp.sum(column**2))
+        pivot = column[j]
+        v = column.at[j].add(jnp.where(pivot >= 0, length, -length))
+        beta = jnp.sum(v**2)
+        v = v * jnp.sqrt(2.0 / jnp.where(beta > 0, beta, 1.0))
+        return x - jnp.outer(v, v @ x), q - jnp.outer(q @ v, v)
+
+    x, q = jax.lax.fori_loop(0, r, reflect, (matrix.T, jnp.eye(k, dtype=matrix.dtype)))
+    return q[:, r:], q[:, :r] @ _inverse_lower(x[:r].T)
+
+
+@null_space.defjvp
+def _null_space_jvp(primals, tangents):
+    # C Z = 0 gives dZ = -Q dC Z up to a rotation of Z, on which nothing that is used depends.
+    (matrix,), (change,) = primals, tangents
+    z, q = null_space(matrix)
+    dz = -q @ (change @ z)
+    dq = z @ ((change @ z).T @ (q.T @ q)) - q @ (change @ q)
+    return (z, q), (dz, dq)
+
+
+def _inverse_lower(lower: Any) -> Any:
+    """The inverse of a lower triangular matrix by forward substitution; zero pivots give zero rows."""
+    n = lower.shape[0]
+
+    def step(i, inverse):
+        row = jnp.where(jnp.arange(n) < i, lower[i], 0.0)
+        pivot = lower[i, i]
+        safe = jnp.where(jnp.abs(pivot) > 1e-13, pivot, jnp.inf)
+        return inverse.at[i].set((jnp.eye(n, dtype=lower.dtype)[i] - row @ inverse) / safe)
+
+    return jax.lax.fori_loop(0, n, step, jnp.zeros_like(lower))
+
+
+@jax.custom_jvp
+def general_inverse(matrix: Any) -> Any:
+    """The inverse of a small square matrix: Gauss-Jordan with row pivoting in plain jnp."""
+    n = matrix.shape[0]
+    work = jnp.concatenate([matrix, jnp.eye(n, dtype=matrix.dtype)], axis=1)
+
+    def step(k, work):
+        pivot = jnp.argmax(jnp.where(jnp.arange(n) >= k, jnp.abs(work[:, k]), -1.0))
+        row, other = work[pivot], work[k]
+        work = work.at[pivot].set(other)
+        row = row / row[k]
+        column = work[:, k].at[k].set(0.0)
+        return (work - jnp.outer(column, row)).at[k].set(row)
+
+    return jax.lax.fori_loop(0, n, step, work)[:, n:]
+
+
+@general_inverse.defjvp
+def _general_inverse_jvp(primals, tangents):
+    inverse = general_inverse(primals[0])
+    return inverse, -inverse @ (tangents[0] @ inverse)
+
+
+def gram_inverse(a: Any, tolerance: float | None = None) -> Any:
+    """(A^T A)^-1 for a tall A (n, k) by symmetric sweeps; with a tolerance, columns that depend
+    on others up to it are left out (zero rows and columns)."""
+    size = jnp.sqrt(jnp.sum(a**2, axis=0))
+    scale = 1.0 / jnp.where(size > 0, size, 1.0)
+    gram = (a * scale).T @ (a * scale)
+    k = gram.shape[0]
+
+    def sweep(g, j, keep):
+        row = g[j]
+        pivot = jnp.where(keep, row[j], 1.0)
+        swept = g - jnp.outer(row, row / pivot)
+        swept = swept.at[j].set(row / pivot).at[:, j].set(row / pivot).at[j, j].set(-1.0 / pivot)
+        return jnp.where(keep, swept, g)
+
+    if tolerance is None:
+        inverse = -jax.lax.fori_loop(0, k, lambda j, g: sweep(g, j, True), gram)
+    else:
+
+        def pivoted(_, carry):
+            g, done = carry
+            rest = jnp.where(done, -1.0, jnp.diagonal(g))
+            j = jnp.argmax(rest)
+            keep = rest[j] > tolerance
+            return sweep(g, j, keep), done.at[j].set(done[j] | keep)
+
+        g, done = jax.lax.fori_loop(0, k, pivoted, (gram, jnp.zeros(k, bool)))
+        inverse = jnp.where(done[:, None] & done[None, :], -g, 0.0)
+    return inverse * scale[:, None] * scale[None, :]
+
+
+def min_norm(a: Any, t: Any, tolerance: float | None = None) -> Any:
+    """The smallest w (n, m) with A^T w = t, for A (n, k) and t (k, m); refined once."""
+    return _min_norm(tolerance, a, t)[0]
+
+
+def solve_gram(a: Any, inverse: Any, t: Any) -> Any:
+    y = inverse @ t
+    return y + inverse @ (t - a.T @ (a @ y))
+
+
+def _min_norm_impl(tolerance, a, t):
+    inverse = gram_inverse(a, tolerance)
+    y = solve_gram(a, inverse, t)
+    return a @ y, y
+
+
+_min_norm = jax.custom_jvp(_min_norm_impl, nondiff_argnums=(0,))
+
+
+@_min_norm.defjvp
+def _min_norm_jvp(tolerance, primals, tangents):
+    # w = A y and A^T w = t, so dw = dA y + A dy with A^T A dy = dt - dA^T w - A^T dA y.
+    (a, t), (da, dt) = primals, tangents
+    w, y = _min_norm(tolerance, a, t)
+    day = da @ y
+    dy = solve_gram(a, gram_inverse(a, tolerance), dt - da.T @ w - a.T @ day)
+    return (w, y), (day + a @ dy, dy)
