@@ -1,3 +1,13 @@
 """Meshless solutions of boundary-value problems by local Taylor expansions, in JAX."""
 
-from jsmitsm.clouds import Cloud as Cloud, box as box, interval as interval, rectangle as rectangle
+from jsmitsm.clouds import Cloud, box, interval, rectangle
+from jsmitsm.errors import SolveError
+from jsmitsm.kernels import Constant, CubicSpline, Gaussian, Kernel, SuperGaussian, Wendland
+from jsmitsm.neighbours import Stencils, stencils
+from jsmitsm.operators import divergence, grad, hessian, laplacian, partial
+from jsmitsm.problem import Problem, condition, dirichlet, fix, free, neumann, periodic, robin
+from jsmitsm.solution import Solution
+from jsmitsm.solve import solve
+from jsmitsm.taylor import multi_indices
+
+__version__ = "0.1.0"

@@ -7,11 +7,12 @@ is fixed by the stencils and known before.
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
+from functools import partial, wraps
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jsmitsm import closure, moments
 from jsmitsm.closure import Recovery
@@ -41,8 +42,50 @@ class Operands(NamedTuple):
     shared: Elimination | None
 
 
+def padded_size(n: int) -> int:
+    """The size class of n particles: shapes repeat between clouds of similar size, so that a
+    compiled program serves the next cloud too; at most one part in eight is wasted."""
+    if n <= _BLOCK:
+        return max(8, 1 << (n - 1).bit_length())
+    step = max(_BLOCK, 1 << ((n - 1).bit_length() - 4))
+    return -(-n // step) * step
+
+
+def _pad(x: Any, n: int, size: int) -> Any:
+    """Repeat the first row until ``size`` rows, where the leading axis has n; others pass."""
+    if x is None or np.ndim(x) == 0 or x.shape[0] != n or n == size:
+        return x
+    xp = np if isinstance(x, np.ndarray) else jnp
+    return xp.concatenate([x, xp.broadcast_to(x[:1], (size - n, *x.shape[1:]))])
+
+
+def _in_size_classes(function: Any) -> Any:
+    """Call ``function(scheme, points, kernel, ids, neighbours, operands, each, whole)`` with every
+    particle axis padded: that of ``ids``, and that of the cloud."""
+
+    @wraps(function)
+    def padded(scheme, points, kernel, ids, neighbours, operands, each=(), whole=()):
+        n, m = points.shape[0], ids.shape[0]
+        big, size = padded_size(n), padded_size(m)
+        cloud_wide = lambda tree: jax.tree.map(lambda x: _pad(x, n, big), tree)  # noqa: E731
+        class_wide = lambda tree: jax.tree.map(lambda x: _pad(x, m, size), tree)  # noqa: E731
+        jac = operands.jac if operands.jac.shape[0] == 1 else class_wide(operands.jac)
+        given = Operands(jac, class_wide(operands.own), cloud_wide(operands.data), operands.shared)
+        made = function(
+            scheme, cloud_wide(points), cloud_wide(kernel), class_wide(ids), class_wide(neighbours), given,
+            class_wide(each), cloud_wide(whole),
+        )  # fmt: skip
+        return jax.tree.map(lambda x: x[:m], made)
+
+    return padded
+
+
+@_in_size_classes
 @partial(jax.jit, static_argnums=(0,))
-def rows(scheme: Scheme, points: Any, kernel: Kernel | None, ids: Any, neighbours: Any, operands: Operands) -> Row:
+def rows(
+    scheme: Scheme, points: Any, kernel: Kernel | None, ids: Any, neighbours: Any, operands: Operands,
+    each: tuple = (), whole: tuple = (),
+) -> Row:  # fmt: skip
     """The rows of the particles ``ids`` (n,) with ``neighbours`` (n, w); particle axis first."""
     TRACES["rows"] += 1
 
@@ -52,16 +95,19 @@ def rows(scheme: Scheme, points: Any, kernel: Kernel | None, ids: Any, neighbour
     return _mapped(particle, ids, neighbours, operands)
 
 
+@_in_size_classes
 @partial(jax.jit, static_argnums=(0,))
 def coefficients(
     scheme: Scheme, points: Any, kernel: Kernel | None, ids: Any, neighbours: Any, operands: Operands,
-    u: Any, gamma: Any, source: Any, given: Any,
+    each: tuple[Any, Any], whole: tuple[Any, Any],
 ) -> Any:  # fmt: skip
-    """Taylor coefficients (n, F, K) of the particles ``ids`` from all values ``u`` (N, F).
+    """Taylor coefficients (n, F, K) of the particles ``ids`` from all values.
 
-    gamma (N, n_data): the values of the neighbours' conditions; source (n, rows); given (n, n_own).
+    each: source (n, rows) and values of the own conditions (n, n_own); whole: all values u (N, F)
+    and the values gamma (N, n_data) of the neighbours' conditions.
     """
     TRACES["coefficients"] += 1
+    u, gamma = whole
 
     def particle(i, near_ids, jac, own, source, given):
         prepared = _prepared(scheme, points, kernel, i, near_ids, operands, jac, own)
@@ -69,7 +115,7 @@ def coefficients(
         values = jnp.concatenate([u[index].reshape(-1), gamma[index].reshape(-1)])
         return moments.coefficients(scheme, *prepared, values, source, given)
 
-    return _mapped(particle, ids, neighbours, operands, source, given)
+    return _mapped(particle, ids, neighbours, operands, *each)
 
 
 def _mapped(particle: Any, ids: Any, neighbours: Any, operands: Operands, *more: Any) -> Any:
@@ -85,7 +131,7 @@ def _mapped(particle: Any, ids: Any, neighbours: Any, operands: Operands, *more:
     # Arrays without numbers cannot be cut into blocks: None stands for them on the way.
     empty: dict[int, Any] = {}
     each = _without_empty([None if one_for_all else operands.jac, operands.own, *more])
-    made = jax.lax.map(jax.checkpoint(one), (ids, neighbours, *each), batch_size=_BLOCK)
+    made = jax.lax.map(jax.checkpoint(one), (ids, neighbours, *each), batch_size=min(_BLOCK, ids.shape[0]))
     leaves, shape = jax.tree.flatten(made, is_leaf=lambda x: x is None)
     full = [jnp.zeros((ids.shape[0], *empty[k].shape)) if k in empty else x for k, x in enumerate(leaves)]
     return jax.tree.unflatten(shape, full)
@@ -114,8 +160,12 @@ def _tests(scheme: Scheme, near: Support) -> Any:
     return closure.tests_iii(scheme, near) if scheme.method == "III" else None
 
 
+@_in_size_classes
 @partial(jax.jit, static_argnums=(0,))
-def recoveries(scheme: Scheme, points: Any, kernel: Kernel, ids: Any, neighbours: Any, operands: Operands) -> Recovery:
+def recoveries(
+    scheme: Scheme, points: Any, kernel: Kernel, ids: Any, neighbours: Any, operands: Operands,
+    each: tuple = (), whole: tuple = (),
+) -> Recovery:  # fmt: skip
     """Stage 1 of I and II for the particles ``ids``; ``operands.own`` without held values."""
     TRACES["rows"] += 1
 
@@ -126,13 +176,18 @@ def recoveries(scheme: Scheme, points: Any, kernel: Kernel, ids: Any, neighbours
     return _mapped(particle, ids, neighbours, operands)
 
 
+@_in_size_classes
 @partial(jax.jit, static_argnums=(0,))
 def closed_rows(
     scheme: Scheme, points: Any, kernel: Kernel, ids: Any, neighbours: Any, operands: Operands,
-    far_ids: Any, recovered: Recovery, constant: Any,
+    each: tuple, whole: tuple[Any, Recovery, Any],
 ) -> tuple[Any, Row]:  # fmt: skip
-    """The rows of I and II over values only, and the neighbours they reach, (n, ns + ns nr)."""
+    """The rows of I and II over values only, and the neighbours they reach, (n, ns + ns nr).
+
+    whole: every particle's neighbours in stage 1, recovery, and its part from source and conditions.
+    """
     TRACES["rows"] += 1
+    far_ids, recovered, constant = whole
 
     def particle(i, near_ids, jac, own):
         near, solution, own, *_ = _prepared(scheme, points, kernel, i, near_ids, operands, jac, own)

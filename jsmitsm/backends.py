@@ -3,13 +3,15 @@
 `Backend(matrix)` factorises a scipy csc array, or sets up a preconditioner; it raises where it
 cannot. `apply(b, transpose)` solves for (n, m) right-hand sides, as well as the method does by
 itself; `sparse.Factor` scales, orders, corrects residuals and changes the backend where one fails.
-`entries` is the number of stored entries, `iterations` those of the last solve.
+`entries` is the number of stored entries, `iterations` counts steps, and `stalled` tells that they
+led nowhere, which a small residual can hide where the matrix is singular.
 """
 
 from __future__ import annotations
 
 import importlib.util
 from collections.abc import Callable
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -17,6 +19,7 @@ import numpy as np
 ITERATIVE = ("amg", "ilu")
 
 
+@cache
 def installed(package: str) -> bool:
     """Whether an optional package can be imported, without importing it."""
     return importlib.util.find_spec(package) is not None
@@ -25,7 +28,7 @@ def installed(package: str) -> bool:
 class Lapack:
     """Dense LU."""
 
-    iterations = 0
+    iterations, stalled = 0, False
 
     def __init__(self, matrix: Any) -> None:
         from scipy.linalg.lapack import dgetrf
@@ -45,7 +48,7 @@ class Lapack:
 class SuperLU:
     """Sparse LU; `ordered`: the matrix stands in a good symmetric order already."""
 
-    iterations = 0
+    iterations, stalled = 0, False
 
     def __init__(self, matrix: Any, ordered: bool) -> None:
         from scipy.sparse.linalg import splu
@@ -69,7 +72,7 @@ class SuperLU:
 class Krylov:
     """BiCGSTAB; a subclass gives the preconditioner and its transpose."""
 
-    tolerance, most = 1e-10, 100  # refinement does the rest: round-off stalls a single run
+    most = 100
     entries: int
 
     def __init__(self, matrix: Any) -> None:
@@ -77,13 +80,13 @@ class Krylov:
 
         self.matrices = {False: sparse.csr_array(matrix), True: sparse.csr_array(matrix.T)}
         self.preconditioners: dict[bool, Callable[[np.ndarray], np.ndarray]] = {}
-        self.iterations = 0
+        self.iterations, self.stalled = 0, False
 
     def preconditioner(self, transpose: bool) -> Callable[[np.ndarray], np.ndarray]:
         """Map that approximates the inverse, or its transpose."""
         raise NotImplementedError
 
-    def apply(self, b: np.ndarray, transpose: bool) -> np.ndarray:
+    def apply(self, b: np.ndarray, transpose: bool, tolerance: float = 1e-10) -> np.ndarray:
         """Solve, (n, m) to (n, m), column by column."""
         if transpose not in self.preconditioners:
             self.preconditioners[transpose] = self.preconditioner(transpose)
@@ -91,15 +94,16 @@ class Krylov:
         x = np.zeros_like(b)
         for k in range(b.shape[1]):
             column = np.ascontiguousarray(b[:, k])
-            x[:, k], steps = _bicgstab(matrix, column, guess, self.tolerance, self.most)
+            x[:, k], steps, gain = _bicgstab(matrix, column, guess, tolerance, self.most)
             self.iterations += steps
+            self.stalled |= gain > 1e-6
         return x
 
 
 def _bicgstab(
     a: Any, b: np.ndarray, guess: Callable[[np.ndarray], np.ndarray], tolerance: float, most: int
-) -> tuple[np.ndarray, int]:
-    """Best iterate of preconditioned BiCGSTAB and the number of steps taken.
+) -> tuple[np.ndarray, int, float]:
+    """Best iterate of preconditioned BiCGSTAB, steps taken, and its residual relative to b.
 
     Source: H. van der Vorst, SIAM J. Sci. Stat. Comput. 13 (1992). Written out because scipy's
     calls threaded BLAS for every product of two vectors, which on a busy machine takes five times
@@ -110,19 +114,21 @@ def _bicgstab(
         return float(np.einsum("i,i->", u, v))
 
     x, r = np.zeros_like(b), b.copy()
-    best, least = x.copy(), dot(b, b)
-    goal = tolerance**2 * least
-    p, v = np.zeros_like(b), np.zeros_like(b)
+    size = start = least = dot(b, b)
+    best, goal = x, tolerance**2 * start
+    shadow, p, v = r, np.zeros_like(b), np.zeros_like(b)
     rho = alpha = omega = 1.0
     step = 0
     while step < most and least > goal:
-        rho, before = dot(b, r), rho
-        if rho == 0.0 or omega == 0.0:
-            break
+        rho, before = dot(shadow, r), rho
+        if abs(rho) < 1e-10 * np.sqrt(dot(shadow, shadow) * size) or omega == 0.0:
+            # Broken down, as it happens where b has one nonzero entry alone: start afresh from r.
+            shadow, p, v = r, np.zeros_like(b), np.zeros_like(b)
+            rho, before, alpha, omega = size, 1.0, 1.0, 1.0
         p = r + (rho / before) * (alpha / omega) * (p - omega * v)
         p_hat = guess(p)
         v = a @ p_hat
-        along = dot(b, v)
+        along = dot(shadow, v)
         if along == 0.0:
             break
         alpha = rho / along
@@ -139,7 +145,7 @@ def _bicgstab(
             break
         if size < least:
             best, least = x, size
-    return best, step
+    return best, step, float(np.sqrt(least / start)) if start else 0.0
 
 
 class AMG(Krylov):

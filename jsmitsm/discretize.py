@@ -52,6 +52,7 @@ class Discretization:
     classes: list[Class]
     held: np.ndarray  # (N, F) bool
     n_own: np.ndarray  # (N,) own conditions of each particle
+    given_stencils: bool  # the user's: nothing outside them is looked at
 
     @property
     def active(self) -> np.ndarray:
@@ -85,13 +86,14 @@ def discretize(
         n_own[group.ids] = group.n_rows + len(group.held)
     scheme = _scheme(method, rec, traced, problem, cloud, basis_terms)
     scheme = replace(scheme, **_conditions_layout(groups, rec))
+    given_stencils = stencils is not None
     if stencils is None:
         stencils = find_stencils(cloud, kernel, default_size(scheme), scheme_size(scheme))
     elif len(stencils) != len(cloud):
         raise ValueError(f"stencils: built for {len(stencils)} particles, the cloud has {len(cloud)}; build them again")
     if kernel is None and method in ("I", "II"):
         kernel = _default_kernel(cloud, stencils)
-    disc = Discretization(cloud, kernel, stencils, traced, rec, groups, scheme, [], held, n_own)
+    disc = Discretization(cloud, kernel, stencils, traced, rec, groups, scheme, [], held, n_own, given_stencils)
     disc.classes = sorted_classes(disc, np.flatnonzero(~held.all(axis=1)), stencils)
     return disc
 
@@ -378,7 +380,7 @@ def _two_stage_rows(disc: Discretization, nums: Numbers, shared: Any) -> tuple[l
     for cls in disc.classes:
         given = operands(disc, nums, cls.ids, cls.scheme, shared)
         reached, row = assembly.closed_rows(
-            cls.scheme, disc.cloud.points, disc.kernel, cls.ids, cls.neighbours, given, far, recovered, constant
+            cls.scheme, disc.cloud.points, disc.kernel, cls.ids, cls.neighbours, given, (), (far, recovered, constant)
         )
         classes.append(replace(cls, neighbours=reached if is_traced(reached) else np.asarray(reached)))
         rows.append(row)
@@ -389,7 +391,7 @@ def _recovery_kernel(disc: Discretization) -> tuple[Kernel, Any]:
     """The kernel of stage 1 and its neighbours: wide enough to hold 1.5 times the free coefficients."""
     points, kernel, near = disc.cloud.points, disc.kernel, disc.stencils.indices
     count = math.ceil(1.5 * len(disc.scheme.free)) + 1
-    if is_traced(near, points, kernel):
+    if disc.given_stencils or is_traced(near, points, kernel):
         away = jnp.where(near >= 0, jnp.sum((points[jnp.maximum(near, 0)] - points[:, None]) ** 2, axis=2), jnp.inf)
         reach = jnp.sqrt(jnp.sort(away, axis=1)[:, min(count, near.shape[1]) - 1])
         reach = jnp.where(jnp.isfinite(reach), reach, 0.0)
@@ -411,7 +413,7 @@ def class_coefficients(disc: Discretization, nums: Numbers, cls: Class, shared: 
     given = operands(disc, nums, cls.ids, cls.scheme, shared)
     source, values = _right_sides(disc, nums, cls)
     return assembly.coefficients(
-        cls.scheme, disc.cloud.points, disc.kernel, cls.ids, cls.neighbours, given, u, nums.gamma, source, values
+        cls.scheme, disc.cloud.points, disc.kernel, cls.ids, cls.neighbours, given, (source, values), (u, nums.gamma)
     )
 
 

@@ -20,6 +20,7 @@ from jax.extend.core import ClosedJaxpr, Literal
 import jsmitsm.matrices  # noqa: F401  (registers its rules)
 import jsmitsm.shuffles  # noqa: F401  (registers its rules)
 from jsmitsm.elementwise import DISCRETE, ELEMENTWISE, RULES, plain_elementwise, rule
+from jsmitsm.program import fingerprint, kept
 from jsmitsm.series import (
     Array,
     Ring,
@@ -38,17 +39,15 @@ from jsmitsm.series import (
 NOTHING, CONSTANT_TERM, EVERYTHING = 0, 1, 2
 # A loop with more operations than this stays a loop in a compiled program.
 UNROLL = 200
-# Bilinear at most: with one series operand they act on each coefficient.
-TERMWISE = {"conv_general_dilated", "fft", "reduce_window_sum", "select_and_gather_add"}
 CALLS = {"jit", "pjit", "closed_call", "core_call", "call", "remat", "checkpoint", "remat2", "custom_vjp_call",
-         "custom_vjp_call_jaxpr", "custom_lin"}  # fmt: skip
+         "custom_vjp_call_jaxpr", "custom_lin", "custom_vmap_call", "composite"}  # fmt: skip
 
 
 def called(eqn: Any) -> ClosedJaxpr | None:
     """The jaxpr of an operation that only calls one, else None."""
     if eqn.primitive.name not in CALLS:
         return None
-    for key in ("jaxpr", "call_jaxpr", "fun_jaxpr"):
+    for key in ("jaxpr", "call_jaxpr", "fun_jaxpr", "call"):
         if key in eqn.params:
             inner = eqn.params[key]
             return inner if isinstance(inner, ClosedJaxpr) else ClosedJaxpr(inner, ())
@@ -116,7 +115,7 @@ Operations = Sequence[tuple[Any, int]]
 def run(ring: Ring, operations: Operations, env: dict[Any, Array], linear: bool = False) -> None:
     """Interpret the operations, adding their results to ``env``.
 
-    ``linear``: inside the derivative of a primitive, where only primitives with a rule may appear.
+    ``linear``: inside the derivative of a primitive, where every operation is linear in the tangents.
     """
     low = Ring(ring.dim, 0)
     for eqn, level in operations:
@@ -140,10 +139,11 @@ def _apply(ring: Ring, eqn: Any, vals: list[Any], linear: bool) -> list[Array]:
     active = [v for v in vals if v.shape[0] > 1]
     if not active:
         return [plain_elementwise(eqn, vals)] if name in ELEMENTWISE else _plain_any(eqn, vals)
-    if name in TERMWISE and len(active) == 1:
-        return _termwise(eqn, vals)
     if linear:
-        raise _unsupported(name)
+        # What is linear in its one series acts on each coefficient, whatever it is.
+        if len(active) > 1:
+            raise _unsupported(name)
+        return _termwise(eqn, vals)
     return _by_derivative(ring, eqn, vals)
 
 
@@ -175,11 +175,14 @@ def _plain_any(eqn: Any, vals: list[Array]) -> list[Array]:
         return bind(eqn, *some)
 
     function = jax.vmap(call, [-1 if b else None for b in batched], -1) if any(batched) else call
-    if on_host(*vals):
-        with jax.ensure_compile_time_eval():
-            out = [np.asarray(v) for v in function(*map(jnp.asarray, args))]
-    else:
-        out = function(*args)
+    try:
+        if on_host(*vals):
+            with jax.ensure_compile_time_eval():
+                out = [np.asarray(v) for v in function(*map(jnp.asarray, args))]
+        else:
+            out = function(*args)
+    except NotImplementedError as error:
+        raise _unsupported(eqn.primitive.name) from error
     return [v[None] if any(batched) else v[None, ..., None] for v in out]
 
 
@@ -329,11 +332,15 @@ def taylor_coefficients(function: Callable[..., Any], points: Any, degree: int, 
     point = jax.ShapeDtypeStruct((dim,), points.dtype)
     closed = jax.make_jaxpr(lambda x, a: jnp.asarray(function(x, *a)))(point, args)
     leaves = jax.tree.leaves(args)
-    traced = any(isinstance(v, jax.core.Tracer) for v in (points, *leaves, *closed.consts))
-    points = points if traced else np.asarray(points)
-    inputs = [variable(points, degree), *map(plain, leaves)]
-    (out,) = evaluate(closed.jaxpr, closed.consts, inputs, dim, degree, None if traced else np)
-    return full_series(Ring(dim, degree), out, n)
+
+    def series(points: Any, leaves: Any, consts: Any) -> Any:
+        inputs = [variable(points, degree), *map(plain, leaves)]
+        return full_series(Ring(dim, degree), evaluate(closed.jaxpr, consts, inputs, dim, degree)[0], n)
+
+    data = (points, leaves, closed.consts)
+    if any(isinstance(v, jax.core.Tracer) for v in jax.tree.leaves(data)):
+        return kept((fingerprint(closed.jaxpr), dim, degree), lambda: jax.jit(series))(*data)
+    return series(*jax.tree.map(np.asarray, data))
 
 
 def _promote(ring: Ring, vals: Sequence[Array], batch: int) -> list[Array]:

@@ -22,7 +22,7 @@ _FORWARDING = {"copy", "copy_p", "reshape", "broadcast_in_dim", "convert_element
                "stop_gradient", "optimization_barrier", "name", "reduce_precision"}  # fmt: skip
 # Linear in all their operands together: the tangents go through the operation itself.
 _LINEAR = {"neg", "sub", "add", "add_any", "reshape", "broadcast_in_dim", "squeeze", "expand_dims", "transpose", "slice",
-           "rev", "reduce_sum", "concatenate", "pad", "convert_element_type", "copy", "copy_p", "cumsum"}  # fmt: skip
+           "rev", "reduce_sum", "concatenate", "stack", "tile", "pad", "convert_element_type", "copy", "copy_p", "cumsum"}  # fmt: skip
 
 
 def inner_jaxprs(eqn: Any) -> list[Jaxpr]:
@@ -250,10 +250,10 @@ def _slope(eqn: Any, vals: list[Any], out: list[Any], slopes: list[Any], factors
         else:
             full = [np.zeros(np.shape(v), v.dtype) if t is None else t for v, t in zip(vals, slopes, strict=True)]
             return bind(eqn, *full)
-    if name == "mul" and np.shape(vals[0]) == np.shape(vals[1]):
+    if name == "mul":
         (x, y), (dx, dy) = vals, slopes
-        parts = [_times(t, v) for t, v in ((dx, y), (dy, x)) if t is not None]
-        return [parts[0] if len(parts) == 1 else jax.lax.add(*map(_array, parts))]
+        parts = [_times(eqn, t, v, out) for t, v in ((dx, y), (dy, x)) if t is not None]
+        return [functools.reduce(jax.lax.add, map(_array, parts))]
     if name == "div" and slopes[1] is None and np.shape(slopes[0]) == np.shape(vals[1]) == out[0].shape:
         return [jax.lax.div(_array(slopes[0]), _array(vals[1]))]
     active = [k for k, t in enumerate(slopes) if t is not None]
@@ -262,7 +262,7 @@ def _slope(eqn: Any, vals: list[Any], out: list[Any], slopes: list[Any], factors
         for k in active:
             if k not in factors:
                 (factors[k],) = _jvp(eqn, vals, [k], [np.ones(np.shape(vals[k]), vals[k].dtype)])
-            parts.append(_times(slopes[k], factors[k]))
+            parts.append(jax.lax.mul(_array(slopes[k]), _array(factors[k])))
         return [functools.reduce(jax.lax.add, map(_array, parts))]
     new = _jvp(eqn, vals, active, [slopes[k] for k in active])
     return [None if skip else t for t, skip in zip(new, exact, strict=True)]
@@ -284,11 +284,11 @@ def _array(value: Any) -> Any:
     return value if isinstance(value, jax.Array | np.ndarray) else np.asarray(value)
 
 
-def _times(slope: Any, value: Any) -> Any:
+def _times(eqn: Any, slope: Any, value: Any, out: list[Any]) -> Any:
     """A product, without the multiplication by a seed of one."""
-    if isinstance(slope, np.ndarray) and slope.ndim == 0 and slope == 1:
+    if np.shape(value) == out[0].shape and isinstance(slope, np.ndarray) and slope.ndim == 0 and slope == 1:
         return value
-    return jax.lax.mul(_array(slope), _array(value))
+    return bind(eqn, slope, value)[0]
 
 
 class Record(NamedTuple):

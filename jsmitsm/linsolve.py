@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -107,7 +108,7 @@ def solve(
         found, cached = _lookup((data, rows, cols), _Settings(n, points, solver, elliptic, refine))
         x = found.solve(b)
         if info is not None:
-            info.update(found.info, cached=cached)
+            info.update(deepcopy(found.info), cached=cached)
         return jnp.asarray(x, dtype)
     data, b = jnp.asarray(data, dtype), jnp.asarray(b, dtype)
     wide = b[:, None] if b.ndim == 1 else b
@@ -158,7 +159,7 @@ def _check(
 
 def _refuse_nonfinite(b: np.ndarray) -> None:
     """Raise for a right-hand side with NaN or infinities."""
-    bad = ~np.isfinite(b).reshape(len(b), -1).all(axis=1)
+    bad = ~np.isfinite(b).all(axis=tuple(range(1, b.ndim)))
     if bad.any():
         raise SingularMatrix("the right-hand side is not finite", np.flatnonzero(bad))
 
@@ -214,7 +215,7 @@ def _same(a: Any, b: Any) -> bool:
     return np.array_equal(a[::step], b[::step], nan) and np.array_equal(a, b, nan)
 
 
-@dataclass
+@dataclass(eq=False)
 class _Entry:
     """A kept factorisation and the arrays it was made of."""
 
@@ -222,8 +223,8 @@ class _Entry:
     settings: _Settings
     factor: Factor
 
-    def matches(self, arrays: Sequence[Any], settings: _Settings) -> bool:
-        return settings == self.settings and all(map(_same, arrays, self.arrays))
+    def same_pattern(self, arrays: Sequence[Any], settings: _Settings) -> bool:
+        return settings == self.settings and all(map(_same, arrays[1:], self.arrays[1:]))
 
 
 _cache: list[_Entry] = []  # the last one used stands last
@@ -267,14 +268,18 @@ def factorisations() -> int:
 
 def _lookup(arrays: Sequence[Any], settings: _Settings) -> tuple[Factor, bool]:
     """The factorisation of (data, rows, cols), and whether it was kept."""
+    order = None
     with _lock:
-        for k in range(len(_cache) - 1, -1, -1):
-            if _cache[k].matches(arrays, settings):
-                _cache.append(_cache.pop(k))
-                return _cache[-1].factor, True
+        for entry in reversed(_cache):
+            if entry.same_pattern(arrays, settings):
+                if _same(arrays[0], entry.arrays[0]):
+                    _cache.remove(entry)
+                    _cache.append(entry)
+                    return entry.factor, True
+                order = entry.factor.order
     s = settings
     data, rows, cols = arrays
-    made = Factor(data, rows, cols, s.n, s.points, s.solver, s.elliptic, s.refine)
+    made = Factor(data, rows, cols, s.n, s.points, s.solver, s.elliptic, s.refine, order)
     # A numpy array may be changed in place after this call; a JAX array cannot.
     kept = tuple(a if isinstance(a, jax.Array) else np.array(a) for a in arrays)
     with _lock:

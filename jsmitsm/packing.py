@@ -1,4 +1,4 @@
-"""Evenly spaced particles: scattering, relaxing and measuring them.
+"""Evenly spaced particles inside of a domain: scattered by an octree, relaxed, holes filled.
 
 A domain is known here only through ``distance(x (M, D)) -> (d (M,), outward (M, D))``, a signed
 distance that need be accurate only near the boundary. Everything runs on the host in numpy.
@@ -11,8 +11,6 @@ from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-
-from jsmitsm.clouds import INTERIOR, Cloud
 
 Spacing = Callable[[np.ndarray], np.ndarray]
 
@@ -34,17 +32,6 @@ class Region(Protocol):
     def distance(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Signed distance (M,), negative inside, and the unit direction of its growth (M, D)."""
         ...
-
-
-class Quality(NamedTuple):
-    """How evenly the particles of a cloud lie; see :func:`quality`."""
-
-    fill: float
-    separation: float
-    mesh_ratio: float
-    evenness: float
-    fill_distance: float
-    separation_distance: float
 
 
 class Cells(NamedTuple):
@@ -254,7 +241,7 @@ def relax(region: Region, points: np.ndarray, boundary: np.ndarray, spacing: Spa
 
 
 def repulsion(points: np.ndarray, every: np.ndarray, found: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    """One step (M, D) in spacings: forces q^-4 of the scaled distance q, cut off at 1.7 where the second shell begins."""
+    """One step (M, D) in spacings: forces q^-4 of the scaled distance q, cut off at 1.7 by the second shell."""
     # Axis by axis: contiguous (M, k) arrays are several times faster here than (M, k, D) ones.
     away = [x[:, None] - y[found] for x, y in zip(points.T, np.ascontiguousarray(every.T))]
     square = sum(a * a for a in away)
@@ -265,9 +252,7 @@ def repulsion(points: np.ndarray, every: np.ndarray, found: np.ndarray, scale: n
     return move * np.minimum(1.0, 0.15 / np.maximum(size, 1e-300))[:, None]
 
 
-def _clear(
-    region: Region, points: np.ndarray, boundary: np.ndarray, h: np.ndarray, clearance: float
-) -> np.ndarray:
+def _clear(region: Region, points: np.ndarray, boundary: np.ndarray, h: np.ndarray, clearance: float) -> np.ndarray:
     """Mask of the points inside and away from the boundary by ``clearance`` spacings."""
     from scipy.spatial import cKDTree
 
@@ -330,6 +315,15 @@ def thin(points: np.ndarray, radii: np.ndarray, priority: np.ndarray) -> np.ndar
     return np.flatnonzero(state == 1)
 
 
+def uncrowded(points: np.ndarray, h: np.ndarray, corners: int) -> np.ndarray:
+    """Indices without the boundary points closer than half a spacing to others across a sharp tip.
+
+    The first ``corners`` points always stay.
+    """
+    order = np.concatenate([np.zeros(corners), np.ones(len(points) - corners)])
+    return np.union1d(thin(points, 0.5 * h, order), np.arange(corners))
+
+
 def circumspheres(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, Any]:
     """Centres (T, D), radii (T,) and vertices (T, D + 1) of the Delaunay simplices, and the triangulation.
 
@@ -352,67 +346,3 @@ def circumspheres(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarra
     corner, edges = corner[solid], edges[solid]
     offset = np.linalg.solve(2.0 * edges, np.einsum("tid,tid->ti", edges, edges)[..., None])[..., 0]
     return corner[:, 0] + offset, np.linalg.norm(offset, axis=1), simplices[solid], mesh
-
-
-def quality(cloud: Cloud, spacing: Any = None) -> Quality:
-    """How evenly the particles of a cloud lie, measured in local spacings so that graded clouds count alike.
-
-    Parameters
-    ----------
-    cloud : a :class:`Cloud`. With normals the boundary is told exactly; without them the domain is taken to be convex.
-    spacing : a number or a function (M, D) -> (M,); by default the mean nearest distance near each particle.
-
-    Returns
-    -------
-    Quality, a named tuple: ``fill`` the radius of the largest empty ball in the domain over the local spacing
-    (0.58 for hexagons), ``separation`` the smallest distance of a pair over the local spacing (1 for any lattice),
-    ``mesh_ratio`` = fill / (separation / 2) (1.15 for hexagons, below 2 is even, above 4 is poor), ``evenness``
-    the least over the mean nearest distance, in local spacings; ``fill_distance`` and ``separation_distance`` the
-    first two in length units (Wendland, Scattered Data Approximation, 2005, has half the latter).
-
-    >>> import jsmitsm as js
-    >>> round(js.quality(js.rectangle((0, 0), (1, 1), (11, 11))).mesh_ratio, 3)
-    1.414
-    """
-    from scipy.spatial import cKDTree
-
-    points = np.asarray(cloud.points)
-    dim = points.shape[1]
-    if len(points) < dim + 2:
-        raise ValueError(f"cloud: {len(points)} particles, at least {dim + 2} are needed to measure how they lie")
-    tree = cKDTree(points)
-    gap, near = tree.query(points, k=min(4 * dim + 1, len(points)))
-    nearest = gap[:, 1]
-    local = nearest[near].mean(axis=1) if spacing is None else spacing_function(spacing)(points)
-    if dim == 1:
-        radii, vertices = np.diff(np.sort(points[:, 0])) / 2, np.argsort(points[:, 0])
-        vertices = np.stack([vertices[:-1], vertices[1:]], axis=1)
-    else:
-        centers, radii, vertices, mesh = circumspheres(points)
-        inside = np.isin(vertices, cloud.groups[INTERIOR]).any(axis=1)
-        inside[inside] = _in_domain(cloud, centers[inside], mesh)
-        if not inside.any():
-            raise ValueError("cloud: no empty ball lies in the domain; are the normals outward and the interior filled?")
-        radii, vertices = radii[inside], vertices[inside]
-    fill = float((radii / local[vertices].mean(axis=1)).max())
-    relative = nearest / local
-    return Quality(
-        fill,
-        float(relative.min()),
-        2.0 * fill / float(relative.min()),
-        float(relative.min() / relative.mean()),
-        float(radii.max()),
-        float(nearest.min()),
-    )
-
-
-def _in_domain(cloud: Cloud, centers: np.ndarray, mesh: Any) -> np.ndarray:
-    """Whether circumcentres lie in the convex hull and, by the normal of the nearest boundary particle, the domain."""
-    from scipy.spatial import cKDTree
-
-    inside = mesh.find_simplex(centers) >= 0
-    if cloud.normals is not None and len(cloud.boundary):
-        points, outward = np.asarray(cloud.points)[cloud.boundary], np.asarray(cloud.normals)[cloud.boundary]
-        which = cKDTree(points).query(centers)[1]
-        inside &= np.einsum("md,md->m", centers - points[which], outward[which]) < 0
-    return inside

@@ -169,22 +169,23 @@ def source_rows(rec: Recursion, residual: Any) -> Any:
 # ---------------------------------------------------------------- elimination
 
 
-def free_indices(rec: Recursion, jac0: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def free_indices(rec: Recursion, jac0: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
     """The paper's choice of free and dependent Taylor coefficients (positions in 0..K-1).
 
     The equation is solved for the pure highest derivative along one axis, the one with the
     largest coefficient (the last of equals: y for Laplace), so the coefficients whose degree
     along that axis reaches the operator's order depend on the others.
 
-    jac0 (S, N): the operator's coefficients at the particles.
+    jac0 (S, N): the operator's coefficients at the particles; None where they are traced, then
+    the last axis that has such a derivative is taken.
     """
     m = rec.order - rec.degrees[0]
     sizes = []
     for axis in range(rec.dim):
         pure = tuple(m if k == axis else 0 for k in range(rec.dim))
         here = [s for s, (_, b) in enumerate(rec.slots) if b == pure and rec.pattern[0][s]]
-        sizes.append(np.abs(jac0[here[0]]).min() if here else 0.0)
-    if m > 0 and max(sizes) <= 1e-8 * np.abs(jac0).max():
+        sizes.append(0.0 if not here else 1.0 if jac0 is None else np.abs(jac0[here[0]]).min())
+    if m > 0 and max(sizes) <= 1e-8 * (1.0 if jac0 is None else np.abs(jac0).max()):
         raise ValueError(
             "method: I, II and III solve the equation for a pure highest derivative along an axis, and every such "
             'derivative is missing or its coefficient vanishes at a particle; use method="S", which needs none'

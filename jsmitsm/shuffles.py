@@ -32,6 +32,11 @@ def _broadcast_in_dim(ring: Ring, eqn: Any, x: Array) -> Array:
     return xp_of(x).broadcast_to(x, (x.shape[0], *shape, x.shape[-1]))
 
 
+@rule("tile")
+def _tile(ring: Ring, eqn: Any, x: Array) -> Array:
+    return xp_of(x).tile(x, (1, *eqn.params["reps"], 1))
+
+
 @rule("transpose")
 def _transpose(ring: Ring, eqn: Any, x: Array) -> Array:
     axes = [k + 1 for k in eqn.params["permutation"]]
@@ -61,6 +66,18 @@ def _split(ring: Ring, eqn: Any, x: Array) -> list[Array]:
 def _concatenate(ring: Ring, eqn: Any, *vals: Array) -> Array:
     vals = tuple(unify(*vals))
     return xp_of(*vals).concatenate(vals, axis=eqn.params["dimension"] + 1)
+
+
+@rule("stack")
+def _stack(ring: Ring, eqn: Any, *vals: Array) -> Array:
+    vals = tuple(unify(*vals))
+    return xp_of(*vals).stack(vals, axis=eqn.params["axis"] + 1)
+
+
+@rule("unstack")
+def _unstack(ring: Ring, eqn: Any, x: Array) -> list[Array]:
+    axis = eqn.params["axis"] + 1
+    return [x[(slice(None),) * axis + (k,)] for k in range(x.shape[axis])]
 
 
 @rule("iota")
@@ -370,7 +387,7 @@ def _series_dot(ring: Ring, x: Array, y: Array, names: list[str], out: str, summ
 
 
 MOVEMENT = frozenset(
-    "reshape squeeze expand_dims broadcast_in_dim transpose rev slice split concatenate pad dynamic_slice "
+    "reshape squeeze expand_dims broadcast_in_dim tile transpose rev slice split concatenate stack unstack pad dynamic_slice "
     "dynamic_update_slice gather copy copy_p reduce_precision optimization_barrier name".split()
 )
 __all__ = ["MOVEMENT", "RULES"]

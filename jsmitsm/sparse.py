@@ -10,6 +10,7 @@ if not the next one takes over and a message says so.
 from __future__ import annotations
 
 import os
+import threading
 import time
 from typing import Any
 
@@ -20,7 +21,8 @@ from jsmitsm.errors import SolveError
 from jsmitsm.ordering import nested_dissection
 
 DENSE_MAX = 300  # unknowns: below, LAPACK beats every sparse code
-ITERATIVE_MIN = {1: None, 2: 200_000, 3: 6_000}  # measured: multigrid overtakes the direct solver
+# Unknowns from which multigrid was faster than LU, refined to round-off and with one adjoint solve.
+ITERATIVE_MIN = {2: 200_000, 3: 6_000}
 BACKWARD_ERROR = 1e-9  # what is accepted of a direct solver
 BACKWARD_ERROR_ITERATIVE = 1e-12  # of an iterative one, which reaches round-off unless it stalls
 SINGULAR = 1e15  # condition number (scaled) above which no digit of a solution means anything
@@ -68,6 +70,7 @@ class Factor:
       solver: "dense", "sparse" (direct), "iterative", or "auto", which decides by size.
       elliptic: whether multigrid can be expected to work, for "auto".
       refine: steps of iterative refinement done in any case; more follow where they are needed.
+      order: `order` of a factor with the same positions, to save finding it again.
 
     Attributes:
       info: dict of what was done: "backend", "unknowns", "entries", "factor_entries",
@@ -96,6 +99,7 @@ class Factor:
         solver: str = "auto",
         elliptic: bool = True,
         refine: int = 1,
+        order: np.ndarray | None = None,
     ) -> None:
         from scipy import sparse
 
@@ -103,6 +107,7 @@ class Factor:
         rows, cols = np.asarray(rows), np.asarray(cols)
         self.n, self.refine = n, refine
         self._lu: Any = None
+        self._lock = threading.RLock()  # a backend may change during a solve
         self.messages: list[str] = []
         self.info: dict[str, Any] = {
             "unknowns": n,
@@ -117,19 +122,20 @@ class Factor:
         self.row_scale, self.col_scale = _scales(data, rows, cols, n, columns=not krylov)
         scaled = data * self.row_scale[rows] * self.col_scale[cols]
         started = time.perf_counter()
-        self.order = None
-        if points is not None and n > DENSE_MAX:
+        self.order = order
+        if order is None and points is not None and n > DENSE_MAX:
             self.order = nested_dissection(rows, cols, np.asarray(points))
+        if self.order is not None:
             place = np.empty(n, np.int32)
             place[self.order] = np.arange(n, dtype=np.int32)
             rows, cols = place[rows], place[cols]
         self.info["seconds"]["ordering"] = time.perf_counter() - started
         self.matrix = sparse.csc_array((scaled, (rows, cols)), shape=(n, n))
-        self._norms = {
-            False: float(abs(self.matrix).sum(axis=1).max(initial=0.0)),
-            True: float(abs(self.matrix).sum(axis=0).max(initial=0.0)),
-        }
         if n:  # nothing is to be solved where every value is known
+            size = abs(self.matrix.data)
+            by_row = np.bincount(self.matrix.indices, size, n)
+            by_column = np.add.reduceat(size, self.matrix.indptr[:-1])  # no column is empty
+            self._norms = {False: float(by_row.max()), True: float(by_column.max())}
             self._factorise()
 
     @property
@@ -154,11 +160,12 @@ class Factor:
         if transpose:
             before, after = after, before
         rhs = before[:, None] * wide
-        if self.order is None:
-            x = self._solve_scaled(rhs, transpose)
-        else:
-            x = np.empty_like(rhs)
-            x[self.order] = self._solve_scaled(rhs[self.order], transpose)
+        with self._lock:
+            if self.order is None:
+                x = self._solve_scaled(rhs, transpose)
+            else:
+                x = np.empty_like(rhs)
+                x[self.order] = self._solve_scaled(rhs[self.order], transpose)
         x *= after[:, None]
         x[:, ~finite] = np.nan
         self.info["seconds"]["solve"] = time.perf_counter() - started
@@ -167,25 +174,33 @@ class Factor:
     def _solve_scaled(self, b: np.ndarray, transpose: bool) -> np.ndarray:
         """Solve with the scaled, ordered matrix; change the backend where one fails."""
         while True:
-            self._lu.iterations = 0
+            self._lu.iterations, self._lu.stalled = 0, False
             x, error = self._refined(b, transpose)
             self.info.update(residual=error, iterations=self._lu.iterations)
-            backend = self._backends[0]
-            if error <= (BACKWARD_ERROR_ITERATIVE if backend in ITERATIVE else BACKWARD_ERROR):
+            backend, stalled = self._backends[0], self._lu.stalled
+            strict = backend in ITERATIVE and self.refine
+            small = error <= (BACKWARD_ERROR_ITERATIVE if strict else BACKWARD_ERROR)
+            if small and not stalled:
                 return x
-            if len(self._backends) == 1:
-                unknowns = self._unknowns_of(near_null_vector(self))
-                raise SingularMatrix(
-                    f"the linear system cannot be solved: relative residual {error:.1e} "
-                    f"after refinement ({backend})",
-                    unknowns,
-                )
-            self._backends.pop(0)
-            self.messages.append(
-                f"{backend} left a relative residual of {error:.1e}; "
-                f"{self._backends[0]} took over"
+            told = f"{'stalled at' if stalled else 'left'} a residual of {error:.1e}"
+            if self._give_way(told):
+                continue
+            if small:
+                self.messages.append(f"{backend} {told}; a direct solver needs too much memory")
+                return x
+            raise SingularMatrix(
+                f"the linear system cannot be solved: {backend} {told} after refinement",
+                self._unknowns_of(near_null_vector(self)),
             )
-            self._factorise()
+
+    def _give_way(self, told: str) -> bool:
+        """Go on to the next backend, if there is one."""
+        if len(self._backends) == 1:
+            return False
+        backend = self._backends.pop(0)
+        self.messages.append(f"{backend} {told}; {self._backends[0]} took over")
+        self._factorise()
+        return True
 
     def _refined(self, b: np.ndarray, transpose: bool) -> tuple[np.ndarray, float]:
         """Solution with its residual corrected until that no longer helps, and backward error."""
@@ -194,7 +209,8 @@ class Factor:
         residual = b - a @ x
         error = self._backward_error(residual, x, b, transpose)
         krylov = self._backends[0] in ITERATIVE
-        # Round-off: an iterative method is taken down to it, where a direct one starts from there.
+        # An iterative method, which a single run leaves at 1e-10, is taken down to round-off; a
+        # direct one starts from there.
         goal, most = (5e-16, self.refine + 5) if krylov else (1e-14, self.refine + 2)
         for step in range(most if self.refine else 0):
             if (error <= goal and (krylov or step >= self.refine)) or not np.isfinite(error):
@@ -222,40 +238,38 @@ class Factor:
     def _factorise(self) -> None:
         """Make the first of the remaining backends; step on where it refuses."""
         started = time.perf_counter()
-        while True:
-            backend = self._backends[0]
-            COUNTS["factorisations"] += 1
-            try:
-                self._lu = BACKENDS[backend](self.matrix)
-                break
-            except (RuntimeError, ValueError, np.linalg.LinAlgError) as error:
-                if len(self._backends) == 1:
-                    raise SingularMatrix(
-                        f"the matrix is singular ({backend}: {error})", self._dependent_unknowns()
-                    ) from error
-                self._backends.pop(0)
-                self.messages.append(f"{backend} failed ({error}); {self._backends[0]} took over")
-        self.info.update(backend=self._backends[0], factor_entries=self._lu.entries)
+        backend = self._backends[0]
+        COUNTS["factorisations"] += 1
+        try:
+            self._lu = BACKENDS[backend](self.matrix)
+        except (RuntimeError, ValueError, np.linalg.LinAlgError) as error:
+            if self._give_way(f"failed ({error})"):
+                return
+            raise SingularMatrix(
+                f"the matrix is singular ({backend}: {error})", self._dependent_unknowns()
+            ) from error
+        self.info.update(backend=backend, factor_entries=self._lu.entries)
         self.info["seconds"]["factorisation"] += time.perf_counter() - started
-        if backend not in ITERATIVE:
-            self._refuse_singular()
+        self._refuse_singular()
 
     def _refuse_singular(self) -> None:
         """Raise where one random right-hand side, or else the condition number, betrays it."""
         probe = np.random.default_rng(0).standard_normal((self.n, 1))
+        if self._backends[0] in ITERATIVE:
+            self._lu.apply(probe, False, tolerance=1e-6)
+            if self._lu.stalled:  # only a direct solver can tell why
+                self._give_way("stalled")
+            return
         growth = abs(self._lu.apply(probe, False)).max() * self._norms[False] / abs(probe).max()
         if growth < 1e-3 * SINGULAR / np.sqrt(self.n):
             return
         condition = condition_estimate(self) if np.isfinite(growth) else np.inf
-        if not condition < SINGULAR:
-            if len(self._backends) > 1 and not np.isfinite(condition):
-                self.messages.append(f"{self._backends.pop(0)} broke down")
-                self._factorise()
-                return
-            raise SingularMatrix(
-                f"the matrix is singular to working precision (condition {condition:.1e})",
-                self._unknowns_of(near_null_vector(self)),
-            )
+        if condition < SINGULAR or (np.isinf(condition) and self._give_way("broke down")):
+            return
+        raise SingularMatrix(
+            f"the matrix is singular to working precision (condition {condition:.1e})",
+            self._unknowns_of(near_null_vector(self)),
+        )
 
     def _dependent_unknowns(self) -> list[int]:
         """Unknowns at fault where a factorisation met a zero pivot."""
@@ -291,22 +305,19 @@ def choose_backends(
     n: int, nnz: int, points: np.ndarray | None, solver: str, elliptic: bool
 ) -> list[str]:
     """Backends to be tried in turn."""
-    # Without coordinates there is no good order, so the direct solver finds its own.
-    direct = ["colamd"] if points is None or n <= DENSE_MAX else ["nested dissection", "colamd"]
     if solver == "dense" or (solver == "auto" and n <= DENSE_MAX):
         return ["lapack"]
-    if solver == "sparse":
-        return direct
-    iterative = ["amg" if installed("pyamg") else "ilu", *direct]
-    if solver == "iterative":
-        return iterative
+    # Without coordinates there is no good order, so the direct solver finds its own.
+    direct = ["colamd"] if points is None or n <= DENSE_MAX else ["nested dissection", "colamd"]
     dim = 2 if points is None else points.shape[1]
+    too_large = estimate_memory(n, nnz, dim) > 0.8 * _memory()
+    iterative = ["amg"] if installed("pyamg") else ["ilu"]
     bordered = points is not None and bool(np.isnan(points).any())
-    least = ITERATIVE_MIN.get(dim)
-    if elliptic and not bordered and least is not None and n >= least and iterative[0] == "amg":
-        return iterative
-    if elliptic and not bordered and estimate_memory(n, nnz, dim) > 0.8 * _memory():
-        return iterative
+    if solver == "auto" and elliptic and not bordered:
+        if too_large or (n >= ITERATIVE_MIN.get(dim, n + 1) and iterative == ["amg"]):
+            solver = "iterative"
+    if solver == "iterative":
+        return iterative if too_large else iterative + direct
     return direct
 
 

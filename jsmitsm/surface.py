@@ -1,0 +1,108 @@
+"""Boundary particles of a signed-distance-like function in 3D: a surface, evenly covered."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from jsmitsm import levelset, packing
+from jsmitsm.packing import Spacing
+
+
+def surface(region: levelset.SdfRegion, spacing: Spacing, seed: int) -> levelset.Boundary:
+    """The zero level in 3D: foot points of small cells, thinned, relaxed on the surface, holes filled."""
+    cells, _ = levelset.cells_near(region, spacing, 0.5)
+    close = np.abs(cells.distance) < 0.6 * cells.widths  # about one foot per cell that the surface cuts
+    feet, arrived = region.project(cells.centers[close], cells.widths[close])
+    arrived &= np.linalg.norm(feet - cells.centers[close], axis=1) < 2 * cells.widths[close]
+    feet, area = feet[arrived], cells.widths[close][arrived] ** 2 / 1.2  # volume of the layer over its thickness
+    crossing = _crossing(region, feet)
+    feet, area = feet[crossing], area[crossing]
+    if not len(feet):
+        raise ValueError("spacing: too coarse for the shape, no boundary was found; reduce it below the shape's width")
+    h = spacing(feet)
+    points = _sparse(feet, h, float((area / h**2).sum()), seed)
+    _check_components(feet, h, points)
+    points = _relax_surface(region, points, spacing, 30)
+    points = _refill(points, feet, h)
+    points = _relax_surface(region, points, spacing, 15)
+    points = points[packing.thin(points, 0.5 * spacing(points), np.arange(len(points)))]
+    return levelset.Boundary(points, _surface_normals(region, points, spacing(points)))
+
+
+def _sparse(feet: np.ndarray, h: np.ndarray, area: float, seed: int) -> np.ndarray:
+    """A random even choice of feet, as many as hexagons of one spacing cover ``area`` (in squared spacings)."""
+    priority = np.random.default_rng(seed).permutation(len(feet))
+    radius, wanted = 0.78, 2.0 / np.sqrt(3.0) * area
+    for _ in range(4):
+        chosen = packing.thin(feet, radius * h, priority)
+        if abs(len(chosen) - wanted) < 0.02 * wanted:
+            break
+        radius *= np.clip(np.sqrt(len(chosen) / wanted), 0.7, 1.2)
+    return feet[chosen]
+
+
+def _crossing(region: levelset.SdfRegion, x: np.ndarray) -> np.ndarray:
+    """Mask of the points where the function changes sign, not merely touches zero."""
+    shift = 1e-7 * region.size * region.distance(x)[1]
+    return (region.evaluate(x + shift)[0] > 0) & (region.evaluate(x - shift)[0] < 0)
+
+
+def _check_components(feet: np.ndarray, h: np.ndarray, points: np.ndarray) -> None:
+    """Raise if a connected part of the surface got too few particles to tell its shape."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import cKDTree
+
+    gap, other = cKDTree(feet).query(feet, k=min(16, len(feet)))
+    row, column = np.nonzero(gap < 1.5 * h[:, None])
+    graph = coo_matrix((np.ones(len(row)), (row, other[row, column])), shape=(len(feet), len(feet)))
+    label = connected_components(graph, directed=False)[1]
+    count = np.bincount(label[cKDTree(feet).query(points)[1]], minlength=label.max() + 1)
+    if count.min() < 10:
+        raise ValueError(
+            f"spacing: too coarse for the shape, only {count.min()} particles fit on the closed boundary near "
+            f"{feet[label == count.argmin()][0]}, at least 10 are needed; reduce the spacing there"
+        )
+
+
+def _relax_surface(region: levelset.SdfRegion, points: np.ndarray, spacing: Spacing, steps: int) -> np.ndarray:
+    """Let particles repel each other along the surface; those that lose it stay where they were."""
+    from scipy.spatial import cKDTree
+
+    for step in range(steps):
+        h, normal = spacing(points), region.distance(points)[1]
+        if step % 3 == 0:
+            k = min(11, len(points))
+            found = cKDTree(points).query(points, k=k)[1][:, 1:]
+        scale = 2.0 / (h[:, None] + h[found])
+        move = h[:, None] * packing.repulsion(points, points, found, scale)
+        move -= np.einsum("md,md->m", move, normal)[:, None] * normal
+        new, arrived = region.project(points + move, 0.3 * h)
+        arrived &= np.linalg.norm(new - points, axis=1) < 0.5 * h
+        points = np.where(arrived[:, None], new, points)
+    return points
+
+
+def _refill(points: np.ndarray, feet: np.ndarray, h: np.ndarray) -> np.ndarray:
+    """Put particles on feet (M, 3) of spacing h (M,) that lie in holes."""
+    from scipy.spatial import cKDTree
+
+    gap = cKDTree(points).query(feet)[0] / h
+    hole = np.flatnonzero(gap > 0.85)
+    return np.concatenate([points, feet[hole[packing.thin(feet[hole], 0.85 * h[hole], -gap[hole])]]])
+
+
+def _surface_normals(region: levelset.SdfRegion, points: np.ndarray, h: np.ndarray) -> np.ndarray:
+    """Unit gradients; on an edge or a corner, the normalised mean of those on its sides."""
+    normal = region.normals(points)
+    across = np.cross(normal, np.eye(3)[np.abs(normal).argmin(axis=1)])
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    other = np.cross(normal, across)
+    total = np.zeros_like(normal)
+    small = 1e-6 * h[:, None]
+    for u, v in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+        total += region.distance(points + small * (u * across + v * other - normal))[1]
+    mean = total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-300)
+    edge = np.einsum("md,md->m", mean, normal) < 1 - 1e-6
+    edge |= np.linalg.norm(total, axis=1) < 4 * (1 - 1e-6)
+    return np.where(edge[:, None], mean, normal)
