@@ -55,6 +55,17 @@ class Discretization:
     given_stencils: bool  # the user's: nothing outside them is looked at
 
     @property
+    def linear(self) -> bool:
+        return self.traced.linear and all(g.linear for g in self.groups)
+
+    @property
+    def floating(self) -> tuple[int, ...]:
+        """Fields that the problem determines only up to a constant: no value of theirs enters."""
+        zero = (0,) * self.rec.dim
+        values = {f for f, b in (*self.rec.slots, *self.scheme.own) if b == zero}
+        return tuple(f for f in range(self.rec.fields) if f not in values) if self.linear else ()
+
+    @property
     def active(self) -> np.ndarray:
         """The particles that carry equations, ascending."""
         return np.flatnonzero(~self.held.all(axis=1))
@@ -99,12 +110,37 @@ def discretize(
 
 
 def sorted_classes(disc: Discretization, ids: np.ndarray, stencils: Stencils) -> list[Class]:
-    """The particles ``ids`` sorted by the number of their own conditions."""
+    """The particles ``ids`` sorted by the number of their own conditions and the width of their stencils."""
+    near = stencils.indices
+    if is_traced(near):
+        wide = np.zeros(len(ids), bool)
+        used = [near.shape[1]] * 2
+    else:
+        counts = np.max(np.where(near[ids] >= 0, np.arange(near.shape[1]), 0), axis=1, initial=0) + 1
+        narrow = int(np.quantile(counts, 0.8)) if len(ids) else 1
+        wide = counts > 1.25 * narrow
+        used = [int(counts[~wide].max(initial=1)), near.shape[1]]
     classes = []
     for count in np.unique(disc.n_own[ids]):
-        some = ids[disc.n_own[ids] == count]
-        classes.append(Class(some, stencils.indices[some], replace(disc.scheme, n_own=int(count))))
+        for some in (ids[(disc.n_own[ids] == count) & (wide == k)] for k in (False, True)):
+            if len(some):
+                width = used[int(wide[np.searchsorted(ids, some[0])])]
+                classes.append(Class(some, near[some][:, :width], replace(disc.scheme, n_own=int(count))))
     return classes
+
+
+def table(disc: Discretization) -> Any:
+    """All stencils in one padded array (N, w), repaired ones too."""
+    near = disc.stencils.indices
+    if is_traced(near) or not disc.classes:
+        return near
+    width = max(near.shape[1], *(c.neighbours.shape[1] for c in disc.classes))
+    out = np.full((len(near), width), -1, np.int32)
+    out[:, : near.shape[1]] = near
+    for c in disc.classes:
+        out[c.ids] = -1
+        out[c.ids, : c.neighbours.shape[1]] = c.neighbours
+    return out
 
 
 def _conditions_layout(groups: list[Group], rec: Recursion) -> dict[str, Any]:
@@ -428,6 +464,19 @@ def _right_sides(disc: Discretization, nums: Numbers, cls: Class) -> tuple[Any, 
     if not cls.scheme.n_own:
         return source, np.zeros((n, 0))
     return source, nums.given[np.searchsorted(nums.own_ids, cls.ids), : cls.scheme.n_own]
+
+
+def all_coefficients(disc: Discretization, nums: Numbers, values: Any) -> Any:
+    """Taylor coefficients (N, F, K) of the particles of all classes; zeros elsewhere."""
+    shared = shared_elimination(disc, nums)
+    parts = [class_coefficients(disc, nums, c, shared, values) for c in disc.classes]
+    shape = (len(disc.cloud), disc.rec.fields, disc.rec.size)
+    ids = np.concatenate([c.ids for c in disc.classes])
+    if is_traced(parts):
+        return jnp.zeros(shape).at[ids].set(jnp.concatenate(parts))
+    out = np.zeros(shape)
+    out[ids] = np.concatenate([np.asarray(p) for p in parts])
+    return out
 
 
 # ------------------------------------------------------------------ the global system

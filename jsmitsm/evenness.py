@@ -58,7 +58,7 @@ def quality(cloud: Cloud, spacing: Any = None) -> Quality:
             inside = ~(np.asarray(cloud.normals)[order[:-1], 0] > 0)
             radii, vertices = radii[inside], vertices[inside]
     else:
-        centers, radii, vertices, mesh = packing.circumspheres(points)
+        centers, radii, vertices, mesh = _circumspheres(points)
         inside = np.asarray(np.isin(vertices, cloud.groups[INTERIOR]).any(axis=1))
         inside[inside] = _in_domain(cloud, centers[inside], mesh)
         if not inside.any():
@@ -86,3 +86,27 @@ def _in_domain(cloud: Cloud, centers: np.ndarray, mesh: Any) -> np.ndarray:
         which = cKDTree(points).query(centers)[1]
         inside &= np.einsum("md,md->m", centers - points[which], outward[which]) < 0
     return inside
+
+
+def _circumspheres(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, Any]:
+    """Centres (T, D), radii (T,) and vertices (T, D + 1) of the Delaunay simplices, and the triangulation.
+
+    These are the largest balls without particles.
+    """
+    from scipy.spatial import Delaunay, QhullError
+
+    try:
+        mesh = Delaunay(points)
+    except QhullError as error:
+        raise ValueError(
+            f"points: {len(points)} particles in {points.shape[1]}D span no simplex (all on one line or plane?)"
+        ) from error
+    simplices = mesh.simplices
+    corner = points[simplices]
+    edges = corner[:, 1:] - corner[:, :1]
+    volume = np.linalg.det(edges)
+    size = np.prod(np.linalg.norm(edges, axis=2), axis=1)
+    solid = np.abs(volume) > 1e-6 * size  # slivers have no centre to speak of
+    corner, edges = corner[solid], edges[solid]
+    offset = np.linalg.solve(2.0 * edges, np.einsum("tid,tid->ti", edges, edges)[..., None])[..., 0]
+    return corner[:, 0] + offset, np.linalg.norm(offset, axis=1), simplices[solid], mesh

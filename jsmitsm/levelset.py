@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -47,7 +47,7 @@ class SdfRegion:
         dim = len(self.lo)
         if not callable(self._sdf):
             raise ValueError(f"sdf: expected a function x (D,) -> scalar, got {self._sdf!r}")
-        if not jax.config.jax_enable_x64:
+        if jax.dtypes.canonicalize_dtype(np.float64) != np.float64:
             raise ValueError(
                 "sdf: JAX computes in float32 here, boundary particles to 1e-10 need float64; put "
                 'jax.config.update("jax_enable_x64", True) at the beginning of the program'

@@ -355,9 +355,7 @@ def _batch(args: Any, axes: Any, *, settings: _Settings, transpose: bool) -> Any
         b = jnp.moveaxis(b, axes[3], -2)
         x = bind(data, rows, cols, b.reshape(*b.shape[:-2], -1))
         return x.reshape(b.shape), b.ndim - 2
-    front = [
-        a if k is None else jnp.moveaxis(a, k, 0) for a, k in zip(args, axes)
-    ]
+    front = [a if k is None else jnp.moveaxis(a, k, 0) for a, k in zip(args, axes)]
     mapped = [k is not None for k in axes]
     core = (1, 1, 1, 2)  # axes of an operand without any batch
     inner = max(a.ndim - m - c for a, m, c in zip(front, mapped, core))  # an older batch axis
@@ -425,9 +423,7 @@ def _plain(data: Any, rows: Any, cols: Any, b: Any, n: int, transpose: bool) -> 
 
 
 solve_p.def_impl(_impl)
-solve_p.def_abstract_eval(
-    lambda data, rows, cols, b, **_: jax.core.ShapedArray(b.shape, b.dtype)
-)
+solve_p.def_abstract_eval(lambda data, rows, cols, b, **_: jax.core.ShapedArray(b.shape, b.dtype))
 ad.primitive_jvps[solve_p] = _jvp
 ad.primitive_transposes[solve_p] = _transpose
 batching.primitive_batchers[solve_p] = _batch

@@ -18,10 +18,14 @@ Spacing = Callable[[np.ndarray], np.ndarray]
 # 1.41 of a face-centred lattice, which relaxation from a random start does not find.
 _DENSITY = {1: 1.0, 2: 2.0 / np.sqrt(3.0), 3: 1.25}
 _NEIGHBOURS = {2: 8, 3: 14}
+# Where the spacing varies, a force that scales with the mean of two spacings drives particles to the coarse side:
+# there are more of them on the fine side. This weight of the neighbour's spacing stops the drift (found by trial).
+_LEAN = {2: 0.6, 3: 0.75}
 # Base cells along the longest side: what decides how small a part of the domain is noticed at all.
 _BASE = {1: 256, 2: 48, 3: 20}
 # A new particle goes where an empty ball has more than this many spacings as radius; 0.58 is a gap between hexagons.
 _HOLE = 0.85
+_PROBES = 6
 # No interior particle comes closer to the boundary than this many spacings.
 CLEARANCE = 0.5
 
@@ -145,7 +149,7 @@ def fill(
     if not len(points):
         return points
     points = relax(region, points, boundary, spacing, 20)
-    points = _repair(region, points, boundary, spacing)
+    points = _repair(region, points, boundary, spacing, rng)
     points = relax(region, points, boundary, spacing, 10)
     points = points[_clear(region, points, boundary, spacing(points), 0.8 * CLEARANCE)]
     return points[np.argsort(morton(points, lo, hi), kind="stable")]
@@ -229,7 +233,7 @@ def relax(region: Region, points: np.ndarray, boundary: np.ndarray, spacing: Spa
         if step % 5 == 0:  # particles move by a few hundredths of a spacing, neighbours outlast some steps
             h = np.concatenate([spacing(points), fixed])
             found = cKDTree(every, balanced_tree=False, compact_nodes=False).query(points, k=k)[1][:, 1:]
-            scale = 2.0 / (h[:count, None] + h[found])
+            scale = scaling(h[:count], h[found], points.shape[1])
             reach = (scale * np.linalg.norm(points[:, None] - every[found], axis=2)) < 2.0
             near = np.flatnonzero(((found >= count) & reach).any(axis=1))
         points += h[:count, None] * repulsion(points, every, found, scale)
@@ -238,6 +242,11 @@ def relax(region: Region, points: np.ndarray, boundary: np.ndarray, spacing: Spa
             push = np.clip(distance + CLEARANCE * h[near], 0.0, 0.3 * h[near])
             points[near] -= push[:, None] * outward
     return points
+
+
+def scaling(h: np.ndarray, other: np.ndarray, dim: int) -> np.ndarray:
+    """One over the spacing (M, k) that counts between particles with h (M,) and their neighbours with other (M, k)."""
+    return 1.0 / ((1.0 - _LEAN[dim]) * h[:, None] + _LEAN[dim] * other)
 
 
 def repulsion(points: np.ndarray, every: np.ndarray, found: np.ndarray, scale: np.ndarray) -> np.ndarray:
@@ -264,40 +273,58 @@ def _clear(region: Region, points: np.ndarray, boundary: np.ndarray, h: np.ndarr
     return clear
 
 
-def _repair(region: Region, points: np.ndarray, boundary: np.ndarray, spacing: Spacing) -> np.ndarray:
+def _repair(
+    region: Region, points: np.ndarray, boundary: np.ndarray, spacing: Spacing, rng: np.random.Generator
+) -> np.ndarray:
     """Drop particles that are crowded, put new ones into holes."""
     from scipy.spatial import cKDTree
 
     h = spacing(points)
-    every = np.concatenate([points, boundary])
-    gap, other = cKDTree(every).query(points, k=2)
+    gap, other = cKDTree(np.concatenate([points, boundary])).query(points, k=2)
     crowded = gap[:, 1] < 0.6 * h
     # Of a crowded pair of interior particles only one goes.
     crowded &= ~((other[:, 1] > np.arange(len(points))) & (other[:, 1] < len(points)))
-    points = points[~crowded]
-    centers, radii, _, _ = circumspheres(np.concatenate([points, boundary]))
-    # Far outside, a user's spacing need not be defined: ask inside only.
-    inside = region.distance(centers)[0] < 0
-    centers, radii = centers[inside], radii[inside]
-    h = spacing(centers)
-    hole = radii > _HOLE * h
-    centers, h, radii = centers[hole], h[hole], radii[hole]
-    hole = _clear(region, centers, boundary, h, CLEARANCE)
-    centers, h, radii = centers[hole], h[hole], radii[hole]
-    return np.concatenate([points, centers[thin(centers, _HOLE * h, -radii / h)]])
+    points, h = points[~crowded], h[~crowded]
+    every = np.concatenate([points, boundary])
+    tree = cKDTree(every)
+    # A hole is seen from the particles around it: step off in some directions, then away from whatever is nearest.
+    count = len(points)
+    direction = rng.normal(size=(_PROBES * count, points.shape[1]))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    h = np.tile(h, _PROBES)
+    probes = np.tile(points, (_PROBES, 1)) + 0.8 * h[:, None] * direction
+    for step in range(6):
+        gap, nearest = tree.query(probes)
+        far = gap > (0.65 if step < 3 else 0.75) * h
+        probes, h, gap, nearest = probes[far], h[far], gap[far], nearest[far]
+        if step < 5:
+            probes = probes + (0.2 * h / gap)[:, None] * (probes - every[nearest])
+    probes = probes[region.distance(probes)[0] < 0]  # elsewhere a user's spacing need not be defined
+    h = spacing(probes)
+    gap = tree.query(probes)[0]
+    hole = np.flatnonzero(gap > _HOLE * h)
+    hole = hole[_clear(region, probes[hole], boundary, h[hole], CLEARANCE)]
+    return np.concatenate([points, probes[hole[thin(probes[hole], _HOLE * h[hole], -gap[hole] / h[hole])]]])
 
 
-def thin(points: np.ndarray, radii: np.ndarray, priority: np.ndarray) -> np.ndarray:
-    """Indices of a maximal subset with no two points closer than their radii; low priority values first."""
+def near_pairs(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Distances and indices (M, k) of as many neighbours as :func:`thin` can need, itself first."""
     from scipy.spatial import cKDTree
 
+    gap, other = cKDTree(points).query(points, k=range(1, min(48, len(points)) + 1))
+    return gap, other
+
+
+def thin(
+    points: np.ndarray, radii: np.ndarray, priority: np.ndarray, pairs: tuple[np.ndarray, np.ndarray] | None = None
+) -> np.ndarray:
+    """Indices of a maximal subset with no two points closer than their radii; low priority values first."""
     if len(points) < 2:
         return np.arange(len(points))
     order = np.argsort(priority, kind="stable")
     rank = np.empty(len(points), int)
     rank[order] = np.arange(len(points))
-    k = min(48, len(points))
-    gap, other = cKDTree(points).query(points, k=k)
+    gap, other = near_pairs(points) if pairs is None else pairs
     close = gap < np.minimum(radii[:, None], radii[other])
     close[:, 0] = False
     a, b = np.nonzero(close)[0], other[close]
@@ -322,27 +349,3 @@ def uncrowded(points: np.ndarray, h: np.ndarray, corners: int) -> np.ndarray:
     """
     order = np.concatenate([np.zeros(corners), np.ones(len(points) - corners)])
     return np.union1d(thin(points, 0.5 * h, order), np.arange(corners))
-
-
-def circumspheres(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, Any]:
-    """Centres (T, D), radii (T,) and vertices (T, D + 1) of the Delaunay simplices, and the triangulation.
-
-    These are the largest balls without particles.
-    """
-    from scipy.spatial import Delaunay, QhullError
-
-    try:
-        mesh = Delaunay(points)
-    except QhullError as error:
-        raise ValueError(
-            f"points: {len(points)} particles in {points.shape[1]}D span no simplex (all on one line or plane?)"
-        ) from error
-    simplices = mesh.simplices
-    corner = points[simplices]
-    edges = corner[:, 1:] - corner[:, :1]
-    volume = np.linalg.det(edges)
-    size = np.prod(np.linalg.norm(edges, axis=2), axis=1)
-    solid = np.abs(volume) > 1e-6 * size  # slivers have no centre to speak of
-    corner, edges = corner[solid], edges[solid]
-    offset = np.linalg.solve(2.0 * edges, np.einsum("tid,tid->ti", edges, edges)[..., None])[..., 0]
-    return corner[:, 0] + offset, np.linalg.norm(offset, axis=1), simplices[solid], mesh

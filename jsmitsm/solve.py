@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import time
-from dataclasses import replace
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm import discretize as dz
-from jsmitsm import linsolve
-from jsmitsm.boundary import is_traced
 from jsmitsm.clouds import Cloud
-from jsmitsm.discretize import Discretization, Numbers
-from jsmitsm.errors import SolveError
+from jsmitsm.discretize import Discretization
+from jsmitsm.system import Run
 from jsmitsm.kernels import Kernel
 from jsmitsm.neighbours import Stencils
+from jsmitsm.newton import newton
 from jsmitsm.problem import Problem
 from jsmitsm.solution import Recipe, Solution
 
@@ -27,42 +24,34 @@ SOLVERS = ("auto", "dense", "sparse", "iterative")
 
 @jax.tree_util.register_pytree_node_class
 class Fit:
-    """What it takes to fit the local polynomials of a solution again."""
+    """What it takes to fit the local polynomials of a solution again.
 
-    def __init__(self, problem, cloud, kernel, neighbours, taylor, recipe, ids):
+    taylor : (N, F, K) the expansions about which a nonlinear problem was last linearised, or None.
+    """
+
+    def __init__(self, problem, cloud, kernel, neighbours, taylor, recipe):
         self.problem, self.cloud, self.kernel = problem, cloud, kernel
         self.neighbours, self.taylor = neighbours, taylor
-        self.recipe, self.ids = recipe, ids
+        self.recipe = recipe
+
+    def discretization(self) -> Discretization:
+        near = Stencils(self.neighbours, None)
+        r = self.recipe
+        return dz.discretize(self.problem, self.cloud, r.method, r.order, self.kernel, near, r.basis_terms)
 
     def coefficients(self, values: Any) -> Any:
         """Taylor coefficients (N, F, K) of every particle."""
-        disc = dz.discretize(
-            self.problem, self.cloud, self.recipe.method, self.recipe.order, self.kernel,
-            Stencils(self.neighbours, None), self.recipe.basis_terms,
-        )  # fmt: skip
-        disc.classes = dz.sorted_classes(disc, np.arange(len(self.cloud)), Stencils(self.neighbours, None))
+        disc = self.discretization()
+        disc.classes = dz.sorted_classes(disc, np.arange(len(self.cloud)), disc.stencils)
         nums = dz.numbers(disc, self.problem, self.taylor, everywhere=True)
-        return fit_all(disc, nums, values)
+        return dz.all_coefficients(disc, nums, values)
 
     def tree_flatten(self):
-        return (self.problem, self.cloud, self.kernel, self.neighbours, self.taylor), (self.recipe, self.ids)
+        return (self.problem, self.cloud, self.kernel, self.neighbours, self.taylor), self.recipe
 
     @classmethod
-    def tree_unflatten(cls, aux, leaves):
-        return cls(*leaves, *aux)
-
-
-def fit_all(disc: Discretization, nums: Numbers, values: Any) -> Any:
-    """Taylor coefficients (N, F, K) of the particles of all classes."""
-    shared = dz.shared_elimination(disc, nums)
-    parts = [dz.class_coefficients(disc, nums, c, shared, values) for c in disc.classes]
-    ids = np.concatenate([c.ids for c in disc.classes])
-    xp = jnp if is_traced(parts) else np
-    out = xp.concatenate([xp.asarray(p) for p in parts])[np.argsort(ids)]
-    if len(ids) == len(disc.cloud):
-        return out
-    place = np.searchsorted(np.sort(ids), np.arange(len(disc.cloud)))
-    return out[np.minimum(place, len(ids) - 1)]
+    def tree_unflatten(cls, recipe, leaves):
+        return cls(*leaves, recipe)
 
 
 def solve(
@@ -119,40 +108,20 @@ def solve(
     start = time.perf_counter()
     _check(problem, cloud, method, order, kernel, stencils, formulation, solver)
     disc = dz.discretize(problem, cloud, method, order, kernel, stencils, basis_terms)
-    recipe = Recipe(method, order, basis_terms, formulation, problem.fields)
-    stats: dict[str, Any] = {"seconds": {"set-up": time.perf_counter() - start}, "messages": [], "skipped": []}
-    if disc.traced.linear and all(g.linear for g in disc.groups):
+    run = Run(disc, problem, solver, throw, repair=kernel is None and stencils is None)
+    run.seconds["set-up"] = time.perf_counter() - start
+    if not disc.classes:
+        raise ValueError("problem: every particle's value is held; nothing is left to solve for")
+    if disc.linear:
         nums = dz.numbers(disc, problem)
-        values, good = _linear_step(disc, nums, solver, stats, throw)
+        values, good = run.step(nums)
         taylor, iterations = None, 1
     else:
-        raise NotImplementedError
-    neighbours = _all_neighbours(disc, cloud)
-    fit = Fit(problem, cloud, kernel, neighbours, taylor, recipe, None)
-    stats["seconds"]["total"] = time.perf_counter() - start
-    return Solution(values, cloud, recipe, fit, good, iterations, stats)
-
-
-def _all_neighbours(disc, cloud):
-    return disc.stencils.indices
-
-
-def _linear_step(disc: Discretization, nums: Numbers, solver: str, stats: dict, throw: bool) -> tuple[Any, Any]:
-    """Assemble and solve one linear system: values (N, F) and whether it went well."""
-    clock = time.perf_counter
-    t0 = clock()
-    classes, rows = dz.all_rows(disc, nums)
-    t1 = clock()
-    data, r, c = dz.matrix(disc, classes, rows)
-    b = dz.right_side(disc, nums, classes, rows)
-    t2 = clock()
-    info: dict[str, Any] = {}
-    x = linsolve.solve(data, r, c, b, n=b.shape[0], solver=solver, info=info)
-    stats["seconds"].update({"local": t1 - t0, "assembly": t2 - t1, "solve": clock() - t2})
-    stats["linear"] = info
-    values = dz.with_held(disc, nums, x)
-    good = jnp.isfinite(values).all() if is_traced(values) else bool(np.isfinite(values).all())
-    return values, good
+        values, taylor, good, iterations = newton(run, u0)
+    run.seconds["total"] = time.perf_counter() - start
+    recipe = Recipe(method, order, basis_terms, formulation, problem.fields)
+    fit = Fit(problem, cloud, disc.kernel, dz.table(disc), taylor, recipe)
+    return Solution(values, cloud, recipe, fit, good, iterations, run.stats())
 
 
 def _check(problem, cloud, method, order, kernel, stencils, formulation, solver) -> None:

@@ -47,7 +47,7 @@ def estimate_memory(n: int, nnz: int, dim: int) -> int:
 
     Example:
       >>> round(estimate_memory(102_400, 2_037_720, 2) / 1e6)
-      502
+      622
     """
     n, per_row = max(int(n), 2), nnz / max(int(n), 1)
     if dim >= 3:
@@ -369,7 +369,7 @@ def condition_estimate(factor: Factor) -> float:
     Example:
       >>> import numpy as np
       >>> index = np.arange(2)
-      >>> condition_estimate(Factor(np.array([1.0, 1e-6]), index, index, 2))
+      >>> condition_estimate(Factor(np.array([1.0, 2.0**-20]), index, index, 2))
       1.0
     """
     n, backend = factor.n, factor._lu

@@ -11,30 +11,37 @@ from jsmitsm.packing import Spacing
 def surface(region: levelset.SdfRegion, spacing: Spacing, seed: int) -> levelset.Boundary:
     """The zero level in 3D: foot points of small cells, thinned, relaxed on the surface, holes filled."""
     cells, _ = levelset.cells_near(region, spacing, 0.5)
-    close = np.abs(cells.distance) < 0.6 * cells.widths  # about one foot per cell that the surface cuts
-    feet, arrived = region.project(cells.centers[close], cells.widths[close])
-    arrived &= np.linalg.norm(feet - cells.centers[close], axis=1) < 2 * cells.widths[close]
-    feet, area = feet[arrived], cells.widths[close][arrived] ** 2 / 1.2  # volume of the layer over its thickness
+    # One random point per cell: a lattice of feet could only be thinned to a few distinct densities.
+    rng = np.random.default_rng(seed)
+    close = np.abs(cells.distance) < 1.5 * cells.widths
+    width = cells.widths[close]
+    starts = cells.centers[close] + rng.uniform(-0.5, 0.5, (len(width), 3)) * width[:, None]
+    close = np.abs(region.distance(starts)[0]) < 0.6 * width
+    starts, width = starts[close], width[close]
+    feet, arrived = region.project(starts, width)
+    arrived &= np.linalg.norm(feet - starts, axis=1) < 2 * width
+    feet, area = feet[arrived], width[arrived] ** 2 / 1.2  # volume of the layer over its thickness
     crossing = _crossing(region, feet)
     feet, area = feet[crossing], area[crossing]
     if not len(feet):
         raise ValueError("spacing: too coarse for the shape, no boundary was found; reduce it below the shape's width")
     h = spacing(feet)
-    points = _sparse(feet, h, float((area / h**2).sum()), seed)
+    points = _sparse(feet, h, float((area / h**2).sum()), rng)
     _check_components(feet, h, points)
-    points = _relax_surface(region, points, spacing, 30)
-    points = _refill(points, feet, h)
-    points = _relax_surface(region, points, spacing, 15)
-    points = points[packing.thin(points, 0.5 * spacing(points), np.arange(len(points)))]
+    for steps in (30, 15, 10):
+        points = _relax_surface(region, points, spacing, steps)
+        points = points[packing.thin(points, 0.65 * spacing(points), np.arange(len(points)))]
+        points = _refill(points, feet, h)
     return levelset.Boundary(points, _surface_normals(region, points, spacing(points)))
 
 
-def _sparse(feet: np.ndarray, h: np.ndarray, area: float, seed: int) -> np.ndarray:
+def _sparse(feet: np.ndarray, h: np.ndarray, area: float, rng: np.random.Generator) -> np.ndarray:
     """A random even choice of feet, as many as hexagons of one spacing cover ``area`` (in squared spacings)."""
-    priority = np.random.default_rng(seed).permutation(len(feet))
+    priority = rng.permutation(len(feet))
     radius, wanted = 0.78, 2.0 / np.sqrt(3.0) * area
+    pairs = packing.near_pairs(feet)
     for _ in range(4):
-        chosen = packing.thin(feet, radius * h, priority)
+        chosen = packing.thin(feet, radius * h, priority, pairs)
         if abs(len(chosen) - wanted) < 0.02 * wanted:
             break
         radius *= np.clip(np.sqrt(len(chosen) / wanted), 0.7, 1.2)
@@ -74,8 +81,7 @@ def _relax_surface(region: levelset.SdfRegion, points: np.ndarray, spacing: Spac
         if step % 3 == 0:
             k = min(11, len(points))
             found = cKDTree(points).query(points, k=k)[1][:, 1:]
-        scale = 2.0 / (h[:, None] + h[found])
-        move = h[:, None] * packing.repulsion(points, points, found, scale)
+        move = h[:, None] * packing.repulsion(points, points, found, packing.scaling(h, h[found], 2))
         move -= np.einsum("md,md->m", move, normal)[:, None] * normal
         new, arrived = region.project(points + move, 0.3 * h)
         arrived &= np.linalg.norm(new - points, axis=1) < 0.5 * h
@@ -88,7 +94,7 @@ def _refill(points: np.ndarray, feet: np.ndarray, h: np.ndarray) -> np.ndarray:
     from scipy.spatial import cKDTree
 
     gap = cKDTree(points).query(feet)[0] / h
-    hole = np.flatnonzero(gap > 0.85)
+    hole = np.flatnonzero(gap > 0.85)  # hexagons leave gaps of 0.58
     return np.concatenate([points, feet[hole[packing.thin(feet[hole], 0.85 * h[hole], -gap[hole])]]])
 
 

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+
 from jsmitsm import backends, linsolve, sparse
 from jsmitsm.errors import SolveError
 from jsmitsm.linsolve import SingularMatrix, factor, factorisations, solve
@@ -149,8 +150,17 @@ def difference(f, x, v, step=1e-5):
     return (f(x + step * v) - f(x - step * v)) / (2 * step)
 
 
-@pytest.mark.parametrize("m, solver", [(5, "auto"), (5, "dense"), (5, "sparse"), (5, "iterative"), (18, "auto")])
-@pytest.mark.parametrize("wrap", [lambda f: f, jax.jit, jax.checkpoint])
+@pytest.mark.parametrize(
+    "m, solver, wrap",
+    [
+        (5, "auto", lambda f: f),
+        (5, "auto", jax.jit),
+        (5, "dense", jax.jit),
+        (5, "sparse", jax.checkpoint),
+        (5, "iterative", lambda f: f),
+        (18, "auto", jax.jit),
+    ],
+)
 def test_first_derivatives(m, solver, wrap):
     value, data, b = loss(solver, m)
     rng = np.random.default_rng(6)
@@ -164,31 +174,32 @@ def test_first_derivatives(m, solver, wrap):
     np.testing.assert_allclose(forward, by_data @ v + by_b @ w, rtol=1e-10)
 
 
-@pytest.mark.parametrize("solver", BACKENDS)
+@pytest.mark.parametrize("solver", ["dense", "sparse"])
 def test_second_derivatives(solver):
     value, data, b = loss(solver, 3)
-    hessian = jax.hessian(value)(data, b)
+    hessian = jax.jit(jax.hessian(value))(data, b)
     v = np.random.default_rng(7).normal(size=data.shape)
-    slope = difference(lambda d: jax.grad(value)(d, b), data, v)
+    slope = difference(jax.jit(lambda d: jax.grad(value)(d, b)), data, v)
     np.testing.assert_allclose(hessian @ v, slope, rtol=1e-6, atol=1e-7 * abs(slope).max())
-    mixed = jax.jacrev(jax.jacfwd(value, 1), 0)(data, b)
-    other = jax.jacfwd(jax.jacrev(value, 0), 1)(data, b)
-    np.testing.assert_allclose(mixed, other.T, atol=1e-10 * abs(other).max())
 
 
 @pytest.mark.parametrize("solver", ["sparse", "iterative"])
-@pytest.mark.parametrize("compiled", [False, True])
-def test_one_factorisation_for_all_derivatives(solver, compiled):
-    value, data, b = loss(solver, 18)
-    wrap = jax.jit if compiled else (lambda f: f)
+def test_one_factorisation_for_all_derivatives(solver):
+    """Eager and compiled transformations agree and share one factorisation."""
+    value, data, b = loss(solver, 3)
+    transformed = [
+        value,
+        jax.grad(value, (0, 1)),
+        jax.jacfwd(value, 1),
+        jax.hessian(value, 1),
+        jax.grad(jax.checkpoint(value)),
+        lambda data, b: jax.vmap(jax.grad(value, 1), (None, 0))(data, jnp.stack([b, 2 * b])),
+        lambda data, b: jax.jvp(jax.grad(value), (data, b), (data, b)),
+    ]
     before = factorisations()
-    wrap(jax.grad(value, (0, 1)))(data, b)
-    wrap(jax.jacfwd(value, 1))(data, b)
-    wrap(jax.vmap(jax.grad(value, 1), (None, 0)))(data, jnp.stack([b, 2 * b]))
-    if not compiled:  # compiling is what takes the time of this test
-        value(data, b)
-        jax.grad(jax.checkpoint(value))(data, b)
-        jax.jvp(jax.grad(value), (data, b), (data, b))
+    for f in transformed:
+        for eager, compiled in zip(jax.tree.leaves(f(data, b)), jax.tree.leaves(jax.jit(f)(data, b))):
+            np.testing.assert_allclose(eager, compiled, rtol=1e-10, atol=1e-12)
     assert factorisations() - before == 1
 
 
@@ -199,13 +210,13 @@ def test_no_callback_outside_jit(monkeypatch):
     value, data, b = loss("sparse")
     monkeypatch.setattr(linsolve.mlir, "emit_python_callback", refuse)
     jax.grad(value)(data, b)
-    jax.hessian(value, 1)(data, b)
     with pytest.raises(AssertionError, match="callback"):
         jax.jit(value)(data, b)
 
 
-@pytest.mark.parametrize("solver", ["auto", *BACKENDS])
-@pytest.mark.parametrize("compiled", [False, True])
+@pytest.mark.parametrize(
+    "solver, compiled", [("auto", False), ("auto", True), ("dense", True), ("sparse", True)]
+)
 def test_vmap_over_everything(solver, compiled):
     """Nested vmaps over matrices, right-hand sides and positions, against a loop."""
     data, rows, cols, points = grid(5)
@@ -226,10 +237,10 @@ def test_vmap_over_everything(solver, compiled):
         mapped = jax.vmap(inner, (0, 0, 0, None), out_axes=1)
         mapped = jax.jit(mapped) if compiled else mapped
         got = mapped(many, turned_rows, turned_cols, sides)
-        for i in range(2):
-            for k in range(3):
-                expected = f(many[k], turned_rows[k], turned_cols[k], sides[i])
-                np.testing.assert_allclose(got[i, k], expected, rtol=1e-9, atol=1e-10)
+        alone = jax.jit(f) if compiled else f
+        for i, k in ((0, 0), (0, 2), (1, 1)):
+            expected = alone(many[k], turned_rows[k], turned_cols[k], sides[i])
+            np.testing.assert_allclose(got[i, k], expected, rtol=1e-9, atol=1e-10)
     across = jax.vmap(jax.vmap(one, (0, None, None, None)), (None, None, None, 0))
     got = across(many, rows, cols, sides)
     np.testing.assert_allclose(got[1, 2], one(many[2], rows, cols, sides[1]), rtol=1e-9, atol=1e-11)

@@ -1,0 +1,178 @@
+"""Local health: the Lebesgue constant of every particle, and the repair of weak stencils.
+
+L_i = sum_g |w_g| bounds how much a particle's equation amplifies errors of its neighbours. A
+plain nearest-neighbour stencil is bad where the density jumps: all neighbours lie on one side.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from jsmitsm import discretize as dz
+from jsmitsm.discretize import Class, Discretization, Numbers
+from jsmitsm.moments import Row
+from jsmitsm.neighbours import nearest
+
+# Up to this a stencil is healthy.
+LEBESGUE = 1.5
+# A moment system that misses what is asked of it by more than this does not determine it.
+DEFECT = 1e-6
+
+
+@dataclass
+class Health:
+    """What was found and done; particle numbers."""
+
+    largest: float = 1.0
+    weak: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
+    repaired: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
+    undetermined: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
+
+
+def examine(classes: list[Class], rows: list[Row]) -> Health:
+    """Largest Lebesgue constant, weak particles, and those whose system is not determined."""
+    health = Health()
+    for cls, row in zip(classes, rows):
+        lebesgue, defect = _worst(row)
+        bad = ~np.isfinite(lebesgue) | ~(defect < DEFECT)
+        health.undetermined = np.append(health.undetermined, cls.ids[bad])
+        health.weak = np.append(health.weak, cls.ids[lebesgue > LEBESGUE])
+        health.largest = max(health.largest, float(np.max(lebesgue[~bad], initial=1.0)))
+    return health
+
+
+def _worst(row: Row) -> tuple[np.ndarray, np.ndarray]:
+    """The largest Lebesgue constant over a particle's equations, and its defect."""
+    return np.asarray(row.lebesgue).max(axis=1), np.asarray(row.defect)
+
+
+def repaired(
+    disc: Discretization, nums: Numbers, classes: list[Class], rows: list[Row]
+) -> tuple[list[Class], list[Row], Health]:
+    """Give weak particles wider stencils, then balanced ones; keep the healthiest found.
+
+    Tried in turn until L <= 1.5: 1.5 and 2.2 times the neighbours, then stencils with some
+    neighbours from every direction.
+    """
+    shared = dz.shared_elimination(disc, nums)
+    points = np.asarray(disc.cloud.points)
+    health = examine(classes, rows)
+    new_classes, new_rows, touched = [], [], []
+    for cls, row in zip(classes, rows):
+        lebesgue = _score(row)
+        weak = np.flatnonzero(lebesgue > LEBESGUE)
+        if not len(weak):
+            new_classes.append(cls)
+            new_rows.append(row)
+            continue
+        best = _Best(cls.ids[weak], lebesgue[weak], row, weak, cls.neighbours[weak])
+        size = int((cls.neighbours >= 0).sum(axis=1).max())
+        for attempt in (_wider(1.5), _wider(2.2), _balanced(1.0), _balanced(1.5), _balanced(2.2)):
+            left = np.flatnonzero(best.lebesgue > LEBESGUE)
+            if not len(left):
+                break
+            ids = best.ids[left]
+            trial = Class(ids, attempt(points, ids, size), cls.scheme)
+            best.update(left, trial.neighbours, dz.class_rows(disc, nums, trial, shared))
+        keep = np.setdiff1d(np.arange(len(cls.ids)), weak)
+        if len(keep):
+            new_classes.append(Class(cls.ids[keep], cls.neighbours[keep], cls.scheme))
+            new_rows.append(_take(row, keep))
+        new_classes.append(Class(best.ids, best.neighbours, cls.scheme))
+        new_rows.append(best.row)
+        touched.append(best.ids[best.changed])
+    after = examine(new_classes, new_rows)
+    fixed = np.concatenate(touched) if touched else np.zeros(0, int)
+    return new_classes, new_rows, replace(health, **{
+        "largest": after.largest, "weak": after.weak, "repaired": fixed, "undetermined": after.undetermined
+    })  # fmt: skip
+
+
+def _score(row: Row) -> np.ndarray:
+    lebesgue, defect = _worst(row)
+    return np.where(np.isfinite(lebesgue) & (defect < DEFECT), lebesgue, np.inf)
+
+
+class _Best:
+    """The healthiest row found so far of every weak particle."""
+
+    def __init__(self, ids: np.ndarray, lebesgue: np.ndarray, row: Row, at: np.ndarray, neighbours: np.ndarray):
+        self.ids, self.lebesgue, self.neighbours = ids, lebesgue.copy(), neighbours
+        self.row = _take(row, at)
+        self.changed = np.zeros(len(ids), bool)
+
+    def update(self, at: np.ndarray, neighbours: np.ndarray, row: Row) -> None:
+        """Take over the rows of ``at`` that came out healthier."""
+        score = _score(row)
+        better = np.flatnonzero(score < self.lebesgue[at])
+        width = max(self.neighbours.shape[1], neighbours.shape[1])
+        self.neighbours = _widened(self.neighbours, width, 1, -1)
+        here, trial = _wide_row(self.row, width), _wide_row(_take(row, better), width)
+        into = at[better]
+        self.neighbours[into] = _widened(neighbours, width, 1, -1)[better]
+        self.row = Row(*(_inserted(x, into, y) for x, y in zip(here, trial)))
+        self.lebesgue[into] = score[better]
+        self.changed[into] = True
+
+
+def _inserted(x: np.ndarray, at: np.ndarray, y: np.ndarray) -> np.ndarray:
+    x = np.array(x)
+    x[at] = y
+    return x
+
+
+def _take(row: Row, at: np.ndarray) -> Row:
+    return Row(*(np.asarray(x)[at] for x in row))
+
+
+def _wide_row(row: Row, width: int) -> Row:
+    return row._replace(weights=_widened(row.weights, width, 2, 0.0), data=_widened(row.data, width, 2, 0.0))
+
+
+def _widened(x: np.ndarray, width: int, axis: int, fill: Any) -> np.ndarray:
+    pad = [(0, 0)] * x.ndim
+    pad[axis] = (0, width - x.shape[axis])
+    return np.pad(x, pad, constant_values=fill)
+
+
+def _wider(factor: float):
+    """The nearest neighbours, ``factor`` times as many."""
+
+    def attempt(points: np.ndarray, ids: np.ndarray, size: int) -> np.ndarray:
+        return nearest(points, min(len(points), round(factor * size)), ids).indices
+
+    return attempt
+
+
+def _balanced(factor: float):
+    """At least a sixteenth of the neighbours from each of eight directions (two in 1D)."""
+
+    def attempt(points: np.ndarray, ids: np.ndarray, size: int) -> np.ndarray:
+        total = min(len(points), round(factor * size))
+        pool = nearest(points, min(len(points), 10 * size), ids).indices
+        offset = points[np.maximum(pool, 0)] - points[ids][:, None]
+        away = np.where(pool >= 0, np.linalg.norm(offset, axis=2), np.inf)
+        order = np.argsort(away, axis=1, kind="stable")
+        pool, away = np.take_along_axis(pool, order, 1), np.take_along_axis(away, order, 1)
+        sector = _sector(np.take_along_axis(offset, order[..., None], 1))
+        quota = np.zeros(pool.shape, bool)
+        share = max(1, -(-size // (16 if points.shape[1] > 1 else 4)))
+        for s in range(int(sector.max()) + 1):
+            here = (sector == s) & (pool >= 0)
+            quota |= here & (np.cumsum(here, axis=1) <= share)
+        quota[:, 0] = True  # the particle itself
+        first = np.argsort(np.where(quota, -1.0, 1.0) * 1.0, axis=1, kind="stable")[:, :total]
+        return np.take_along_axis(pool, first, 1)
+
+    return attempt
+
+
+def _sector(offset: np.ndarray) -> np.ndarray:
+    """Eight directions around a particle: octants in 3D, half quadrants in 2D, sides in 1D."""
+    dim = offset.shape[2]
+    if dim == 2:
+        return np.floor((np.arctan2(offset[..., 1], offset[..., 0]) + np.pi) / (np.pi / 4)).astype(int) % 8
+    return ((offset > 0) * (1 << np.arange(dim))).sum(axis=2)

@@ -1,0 +1,196 @@
+"""One linear solve from rows to values: repair, global system, solve, and checks by name."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from jsmitsm import discretize as dz
+from jsmitsm import health, linsolve
+from jsmitsm.boundary import is_traced
+from jsmitsm.discretize import Class, Discretization, Numbers
+from jsmitsm.errors import SolveError
+from jsmitsm.moments import Row
+from jsmitsm.problem import Problem
+
+# A solvable pure Neumann problem leaves a mean residual below this part of its data.
+COMPATIBLE = 1e-6
+
+
+class Run:
+    """One call of ``solve``: the discretisation, its options, and what happened."""
+
+    def __init__(self, disc: Discretization, problem: Problem, solver: str, throw: bool, repair: bool):
+        self.disc, self.problem = disc, problem
+        self.solver, self.throw, self.repair = solver, throw, repair
+        self.seconds: dict[str, float] = {"local": 0.0, "assembly": 0.0, "solve": 0.0}
+        self.messages: list[str] = []
+        self.linear: dict[str, Any] = {}
+        self.health: health.Health | None = None
+        self.rows: tuple[list[Class], list[Row]] | None = None
+
+    def local_rows(self, nums: Numbers) -> tuple[list[Class], list[Row]]:
+        """The rows of all classes, weak stencils repaired the first time."""
+        disc = self.disc
+        classes, rows = dz.all_rows(disc, nums)
+        if is_traced(rows):
+            return classes, rows
+        if self.repair and self.health is None and disc.scheme.method in ("S", "III"):
+            classes, rows, self.health = health.repaired(disc, nums, classes, rows)
+            disc.classes = classes
+            self._tell_repairs()
+        else:
+            self.health = health.examine(classes, rows)
+        bad = self.health.undetermined
+        if len(bad):
+            self.fail(
+                f"the moment systems of {len(bad)} particle(s) do not determine the solution, first {_some(bad)}: too "
+                "few neighbours, or neighbours in a special position; widen the support (h, d or stencils), lower "
+                "the order, or move the particles",
+                bad,
+            )
+        return classes, rows
+
+    def _tell_repairs(self) -> None:
+        found = self.health
+        if found is not None and len(found.repaired):
+            self.messages.append(
+                f"{len(found.repaired)} weak stencil(s) were widened or balanced, first {_some(found.repaired)}."
+            )
+        if found is not None and len(found.weak):
+            self.messages.append(
+                f"{len(found.weak)} particle(s) stay weak (Lebesgue constant above {health.LEBESGUE}, at most "
+                f"{found.largest:.3g}), first {_some(found.weak)}: the cloud is too coarse or one-sided there."
+            )
+
+    def fail(self, message: str, particles: Any = ()) -> None:
+        """Raise, or note the failure where the caller asked for that."""
+        if self.throw:
+            raise SolveError(message, [int(i) for i in np.asarray(particles)[:100]])
+        self.messages.append(f"FAILED: {message}.")
+
+    def step(self, nums: Numbers) -> tuple[Any, Any]:
+        """Assemble and solve one linear system: values (N, F), and whether it went well."""
+        clock, disc = time.perf_counter, self.disc
+        t0 = clock()
+        classes, rows = self.local_rows(nums)
+        t1 = clock()
+        data, r, c = dz.matrix(disc, classes, rows)
+        b = dz.right_side(disc, nums, classes, rows)
+        t2 = clock()
+        x, good = self.solved(data, r, c, b)
+        values = dz.with_held(disc, nums, x)
+        for name, took in (("local", t1 - t0), ("assembly", t2 - t1), ("solve", clock() - t2)):
+            self.seconds[name] += took
+        if is_traced(values):
+            return values, jnp.isfinite(values).all()
+        return values, bool(good and np.isfinite(values).all() and not self._failed)
+
+    @property
+    def _failed(self) -> bool:
+        return any(m.startswith("FAILED") for m in self.messages)
+
+    def solved(self, data: Any, r: Any, c: Any, b: Any) -> tuple[Any, bool]:
+        """Solve the global system; floating fields get a zero mean by a Lagrange multiplier."""
+        disc = self.disc
+        free = np.flatnonzero(~disc.held.reshape(-1))
+        n, fields = len(free), disc.rec.fields
+        points = None if is_traced(disc.cloud.points) else np.asarray(disc.cloud.points)[free // fields]
+        if disc.floating:
+            data, r, c, b, points = _bordered(data, r, c, b, points, free % fields, disc.floating)
+        try:
+            x = linsolve.solve(
+                data, r, c, b, n=n + len(disc.floating), points=points, solver=self.solver,
+                elliptic=fields == 1 and not disc.floating, info=self.linear,
+            )  # fmt: skip
+        except linsolve.SingularMatrix as error:
+            at = np.array([u for u in error.unknowns if u < n], int)
+            particles = free[at] // fields
+            self.fail(
+                f"{error.args[0].rstrip('.')}: particles {_some(particles)}; is a condition missing, a part of the cloud "
+                "not connected, or the operator at a resonance?",
+                particles,
+            )
+            return np.full(n, np.nan), False
+        if not is_traced(x):
+            x = np.asarray(x)
+            if disc.floating:
+                self._check_compatible(x[n:], np.asarray(b)[:n])
+        return x[:n], True
+
+    def _check_compatible(self, multiplier: np.ndarray, b: np.ndarray) -> None:
+        """A field without values: its data must balance."""
+        size = np.abs(b).mean() if b.any() else 1.0
+        rest = float(np.abs(multiplier).max() / size)
+        self.messages.append("The conditions fix the solution only up to a constant; its mean over the particles is 0.")
+        if rest > max(COMPATIBLE, self._truncation()):
+            self.fail(
+                f"the problem has no solution: nothing fixes the value and the data do not balance (mean residual "
+                f"{rest:.1e} of the data); correct the source or the fluxes, or hold a value with js.dirichlet or js.fix"
+            )
+
+    def _truncation(self) -> float:
+        """How far balanced data may be off by discretisation: about h^(p-1) for order p."""
+        disc = self.disc
+        points = np.asarray(disc.cloud.points)
+        cells = len(points) ** (1.0 / disc.rec.dim)
+        return 10.0 * float(4.0 / cells) ** max(disc.rec.order - 1, 1)
+
+    def stats(self) -> dict[str, Any]:
+        """What a user may want to know about the solve."""
+        disc = self.disc
+        out: dict[str, Any] = {
+            "seconds": dict(self.seconds),
+            "particles": len(disc.cloud),
+            "unknowns": int((~disc.held).sum()),
+            "neighbours": max((c.neighbours.shape[1] for c in disc.classes), default=0),
+            "linear": self.linear,
+            "skipped": skipped(disc),
+            "messages": list(self.messages),
+        }
+        if "residual" in self.linear:
+            out["residual"] = self.linear["residual"]
+        if self.health is not None:
+            out["lebesgue_max"] = self.health.largest
+            out["repaired"] = self.health.repaired
+            out["weak"] = self.health.weak
+        return out
+
+
+def _bordered(data, r, c, b, points, field, floating):
+    """Append one row and column of ones for every floating field."""
+    n = len(field)
+    xp = jnp if is_traced(data, b) else np
+    for k, f in enumerate(floating):
+        ids = np.flatnonzero(field == f)
+        line = np.full(len(ids), n + k)
+        data = xp.concatenate([data, np.ones(2 * len(ids))])
+        r, c = np.concatenate([r, ids, line]), np.concatenate([c, line, ids])
+    b = xp.concatenate([b, np.zeros(len(floating))])
+    if points is not None:
+        points = np.concatenate([points, np.full((len(floating), points.shape[1]), np.nan)])
+    return data, r, c, b, points
+
+
+def skipped(disc: Discretization) -> list[str]:
+    """What the scene made unnecessary."""
+    traced, method = disc.traced, disc.scheme.method
+    out = []
+    if method in ("S", "SSPH", "I"):
+        out.append("kernel derivatives")
+    if traced.constant and disc.rec.scale_free:
+        out.append("recursion per particle")
+    if traced.source == "zero":
+        out.append("particular part")
+    if disc.held.all(axis=1).any():
+        out.append(f"{int(disc.held.all(axis=1).sum())} particles with held values")
+    out += ["Taylor coefficients until asked for", "error estimate until asked for"]
+    return out
+
+
+def _some(index: Any, most: int = 6) -> str:
+    index = np.asarray(index)
+    return f"[{', '.join(str(int(i)) for i in index[:most])}{', ...' if len(index) > most else ''}]"
