@@ -2,6 +2,7 @@
 
 from jsmitsm.clouds import Cloud, box, interval, rectangle
 from jsmitsm.errors import SolveError
+from jsmitsm.estimate import factorize
 from jsmitsm.kernels import Constant, CubicSpline, Gaussian, Kernel, SuperGaussian, Wendland
 from jsmitsm.neighbours import Stencils, stencils
 from jsmitsm.operators import divergence, grad, hessian, laplacian, partial

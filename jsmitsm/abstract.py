@@ -10,7 +10,7 @@ import numpy as np
 from jax.extend.core import Literal
 
 from jsmitsm.elementwise import DISCRETE, ELEMENTWISE, RULES
-from jsmitsm.jets import called
+from jsmitsm.jaxprs import called, literal
 from jsmitsm.series import Ring
 from jsmitsm.shuffles import MOVEMENT
 
@@ -61,7 +61,7 @@ def interpret(jaxpr: Any, consts: Sequence[Facts], args: Sequence[Facts]) -> lis
     env = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*consts, *args], strict=True))
 
     def read(v: Any) -> Facts:
-        return known(np.asarray(v.val, v.aval.dtype)) if isinstance(v, Literal) else env[v]
+        return known(literal(v)) if isinstance(v, Literal) else env[v]
 
     for eqn in jaxpr.eqns:
         env.update(zip(eqn.outvars, _step(eqn, [read(v) for v in eqn.invars]), strict=True))
@@ -215,7 +215,7 @@ def _select_n(eqn: Any, facts: list[Facts]) -> list[Facts] | None:
 def _reduce_sum(eqn: Any, facts: list[Facts]) -> list[Facts]:
     (x,) = facts
     axes = tuple(eqn.params["axes"])
-    sure = x.known.all(axes)
+    sure = np.asarray(x.known.all(axes))
     value = np.where(sure, np.where(x.known, x.value, 0).sum(axes), 0).astype(eqn.outvars[0].aval.dtype)
     return [Facts(value, sure, np.where(sure, 0, np.bitwise_or.reduce(x.depends, axis=axes)).astype(np.uint8))]
 

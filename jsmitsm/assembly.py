@@ -17,7 +17,7 @@ import numpy as np
 from jsmitsm import closure, moments
 from jsmitsm.closure import Recovery
 from jsmitsm.kernels import Kernel
-from jsmitsm.moments import Elimination, Row, Scheme, Support
+from jsmitsm.moments import Block, Elimination, Row, Scheme, Support
 from jsmitsm.recursion import row_levels
 
 # Particles per block: larger blocks leave the cache and are several times slower.
@@ -114,6 +114,22 @@ def coefficients(
         index = jnp.where(near_ids >= 0, near_ids, i)
         values = jnp.concatenate([u[index].reshape(-1), gamma[index].reshape(-1)])
         return moments.coefficients(scheme, *prepared, values, source, given)
+
+    return _mapped(particle, ids, neighbours, operands, *each)
+
+
+@_in_size_classes
+@partial(jax.jit, static_argnums=(0,))
+def blocks(
+    scheme: Scheme, points: Any, kernel: Kernel | None, ids: Any, neighbours: Any, operands: Operands,
+    each: tuple[Any, Any], whole: tuple = (),
+) -> Block:  # fmt: skip
+    """The least-squares blocks of the particles ``ids``; each: source (n, rows) and given (n, n_own)."""
+    TRACES["rows"] += 1
+
+    def particle(i, near_ids, jac, own, source, given):
+        near, solution, own, data, _ = _prepared(scheme, points, kernel, i, near_ids, operands, jac, own)
+        return moments.block(scheme, near, solution, own, data, source, given)
 
     return _mapped(particle, ids, neighbours, operands, *each)
 

@@ -544,6 +544,85 @@ def right_side(disc: Discretization, nums: Numbers, classes: list[Class], rows: 
     return xp.concatenate(parts)[order] if parts else np.zeros(0)
 
 
+def least_squares(disc: Discretization, nums: Numbers) -> tuple[Any, Any, Any, Any]:
+    """The normal equations of the least-squares form, as coordinates, and their right-hand side.
+
+    Every particle contributes the misfit of its local fit, those with held values too: the
+    projector of a fit is idempotent, so nothing is squared.
+    """
+    shared = shared_elimination(disc, nums)
+    unknown, fields = disc.unknowns, disc.rec.fields
+    held = nums.held
+    n = int(unknown.max(initial=-1)) + 1
+    parts, b = [], np.zeros(n)
+    for cls in sorted_classes(disc, nums.ids, Stencils(table(disc), None)):
+        given = operands(disc, nums, cls.ids, cls.scheme, shared)
+        made = assembly.blocks(
+            cls.scheme, disc.cloud.points, disc.kernel, cls.ids, cls.neighbours, given, _right_sides(disc, nums, cls)
+        )
+        near = cls.neighbours
+        xp = jnp if is_traced(near, made, held, nums.gamma) else np
+        index = xp.maximum(near, 0)
+        place = xp.where((near >= 0)[..., None], xp.asarray(unknown)[index], -1).reshape(len(cls.ids), -1)
+        known = xp.where((near >= 0)[..., None], xp.asarray(held)[index], 0.0).reshape(len(cls.ids), -1)
+        known = xp.where(place >= 0, 0.0, known)
+        extra = xp.asarray(nums.gamma)[index].reshape(len(cls.ids), -1)
+        given_data = xp.concatenate([known, extra], axis=1)
+        m = place.shape[1]
+        matrix, load = xp.asarray(made.matrix), xp.asarray(made.load)
+        right = (load - xp.einsum("nij,nj->ni", matrix, given_data))[:, :m]
+        r = xp.broadcast_to(place[:, :, None], (len(cls.ids), m, m))
+        c = xp.broadcast_to(place[:, None, :], (len(cls.ids), m, m))
+        keep = (r >= 0) & (c >= 0)
+        if xp is np:
+            np.add.at(b, place[place >= 0], right[place >= 0])
+            parts.append((matrix[:, :m, :m][keep], r[keep], c[keep]))
+        else:
+            b = jnp.asarray(b).at[jnp.maximum(place, 0)].add(jnp.where(place >= 0, right, 0.0))
+            if is_traced(near):
+                flat = (jnp.where(keep, matrix[:, :m, :m], 0.0), jnp.where(keep, r, 0), jnp.where(keep, c, 0))
+                parts.append(tuple(x.reshape(-1) for x in flat))
+            else:
+                at = np.nonzero(np.asarray(keep))
+                parts.append((matrix[:, :m, :m][at], np.asarray(r)[at], np.asarray(c)[at]))
+    data, r, c = zip(*parts)
+    xp = jnp if is_traced(parts) else np
+    return xp.concatenate(data), (jnp if is_traced(r) else np).concatenate(r), (jnp if is_traced(c) else np).concatenate(c), b
+
+
+def prefers_least_squares(disc: Discretization, nums: Numbers) -> bool:
+    """Whether information travels: operators of first order, hyperbolic ones of second, and those
+    whose convection outweighs diffusion between neighbours (cell Peclet number above 2).
+
+    There a value predicted by neighbours on all sides is the wrong global form.
+    """
+    rec = disc.rec
+    orders = {rec.order - q for q in rec.degrees}
+    if disc.scheme.method != "S" or rec.fields > 1 or is_traced(nums.jac):
+        return False
+    if orders == {1}:
+        return True
+    if orders != {2}:
+        return False
+    symbol = np.zeros((nums.jac.shape[-1], rec.dim, rec.dim))
+    for s, (_, b) in enumerate(rec.slots):
+        if sum(b) == 2:
+            i, j = [axis for axis in range(rec.dim) for _ in range(b[axis])]
+            symbol[:, i, j] += nums.jac[0, s, 0] / 2
+            symbol[:, j, i] += nums.jac[0, s, 0] / 2
+    values = np.linalg.eigvalsh(symbol)
+    diffusion = np.abs(values).max(axis=1)
+    if (values[:, 0] * values[:, -1] < -1e-10 * diffusion**2).any():
+        return True
+    drift = [s for s, (_, b) in enumerate(rec.slots) if sum(b) == 1]
+    if not drift or is_traced(disc.cloud.points):
+        return False
+    speed = np.linalg.norm(nums.jac[0, drift, 0], axis=0)
+    points = np.asarray(disc.cloud.points)
+    apart = (np.prod(np.ptp(points, axis=0)) / len(points)) ** (1.0 / rec.dim)
+    return bool(np.median(speed * apart / diffusion) > 2.0)
+
+
 def with_held(disc: Discretization, nums: Numbers, x: Any) -> Any:
     """All values (N, F) from the unknowns x (n,)."""
     place = np.flatnonzero(~disc.held.reshape(-1))

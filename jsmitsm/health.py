@@ -70,12 +70,15 @@ def repaired(
             continue
         best = _Best(cls.ids[weak], lebesgue[weak], row, weak, cls.neighbours[weak])
         size = int((cls.neighbours >= 0).sum(axis=1).max())
+        width = min(len(points), round(2.2 * size))
         for attempt in (_wider(1.5), _wider(2.2), _balanced(1.0), _balanced(1.5), _balanced(2.2)):
             left = np.flatnonzero(best.lebesgue > LEBESGUE)
             if not len(left):
                 break
-            ids = best.ids[left]
-            trial = Class(ids, attempt(points, ids, size), cls.scheme)
+            # One shape for all attempts: compiling costs far more than computing a few rows twice.
+            left = np.resize(left, len(weak))
+            near = attempt(points, best.ids[left], size)[:, :width]
+            trial = Class(best.ids[left], _widened(near, width, 1, -1), cls.scheme)
             best.update(left, trial.neighbours, dz.class_rows(disc, nums, trial, shared))
         keep = np.setdiff1d(np.arange(len(cls.ids)), weak)
         if len(keep):

@@ -9,17 +9,17 @@ sum_i s_i d/ds_i takes the place of d/ds.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import lru_cache
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Literal
+from jax.extend.core import Literal
 
 import jsmitsm.matrices  # noqa: F401  (registers its rules)
 import jsmitsm.shuffles  # noqa: F401  (registers its rules)
-from jsmitsm.elementwise import DISCRETE, ELEMENTWISE, RULES, plain_elementwise, rule
+from jsmitsm.elementwise import ELEMENTWISE, RULES, plain_elementwise, rule
+from jsmitsm.jaxprs import CONSTANT_TERM, EVERYTHING, NOTHING, bind, called, derivative, levels, literal, unsupported
 from jsmitsm.program import fingerprint, kept
 from jsmitsm.series import (
     Array,
@@ -35,32 +35,8 @@ from jsmitsm.series import (
     xp_of,
 )
 
-# How much of a value is asked for: nothing, its degree 0, all of it.
-NOTHING, CONSTANT_TERM, EVERYTHING = 0, 1, 2
 # A loop with more operations than this stays a loop in a compiled program.
 UNROLL = 200
-CALLS = {"jit", "pjit", "closed_call", "core_call", "call", "remat", "checkpoint", "remat2", "custom_vjp_call",
-         "custom_vjp_call_jaxpr", "custom_lin", "custom_vmap_call", "composite"}  # fmt: skip
-
-
-def called(eqn: Any) -> ClosedJaxpr | None:
-    """The jaxpr of an operation that only calls one, else None."""
-    if eqn.primitive.name not in CALLS:
-        return None
-    for key in ("jaxpr", "call_jaxpr", "fun_jaxpr", "call"):
-        if key in eqn.params:
-            inner = eqn.params[key]
-            return inner if isinstance(inner, ClosedJaxpr) else ClosedJaxpr(inner, ())
-    return None
-
-
-def bind(eqn: Any, *args: Any) -> list[Any]:
-    """Perform the operation on JAX values."""
-    params = eqn.primitive.get_bind_params(eqn.params)
-    if isinstance(params, tuple):  # JAX before 0.10: functions come first
-        args, params = (*params[0], *args), params[1]
-    out = eqn.primitive.bind(*args, **params)
-    return list(out) if eqn.primitive.multiple_results else [out]
 
 
 def plain(value: Any) -> np.ndarray | jax.Array:
@@ -70,43 +46,7 @@ def plain(value: Any) -> np.ndarray | jax.Array:
 
 
 def _literal(v: Any) -> np.ndarray:
-    return np.asarray(v.val, v.aval.dtype).reshape(1, *v.aval.shape, 1)
-
-
-def levels(jaxpr: Any, wanted: Sequence[int]) -> list[tuple[Any, int]]:
-    """The operations the wanted outputs need, in order, and how much of each."""
-    need: dict[Any, int] = {}
-
-    def ask(v: Any, level: int) -> None:
-        if not isinstance(v, Literal) and need.get(v, 0) < level:
-            need[v] = level
-
-    for v, level in zip(jaxpr.outvars, wanted, strict=True):
-        ask(v, level)
-    kept = []
-    for eqn in reversed(jaxpr.eqns):
-        level = max((need.get(v, NOTHING) for v in eqn.outvars), default=NOTHING)
-        if level == NOTHING:
-            continue
-        kept.append((eqn, level))
-        name = eqn.primitive.name
-        for k, v in enumerate(eqn.invars):
-            ask(v, _operand_level(eqn, name, k, level))
-    return kept[::-1]
-
-
-def _operand_level(eqn: Any, name: str, k: int, level: int) -> int:
-    """How much of operand k is needed."""
-    if name in DISCRETE or (name in ("select_n", "cond") and k == 0):
-        return CONSTANT_TERM
-    if name in ("gather", "dynamic_slice", "scatter", "scatter-add") and k == 1:
-        return CONSTANT_TERM
-    if name == "custom_linear_solve":
-        lengths = eqn.params["const_lengths"]
-        first = lengths.matvec + lengths.vecmat
-        inside = first <= k < first + lengths.solve or k >= sum(lengths)
-        return level if inside else NOTHING
-    return level
+    return literal(v).reshape(1, *v.aval.shape, 1)
 
 
 Operations = Sequence[tuple[Any, int]]
@@ -142,7 +82,7 @@ def _apply(ring: Ring, eqn: Any, vals: list[Any], linear: bool) -> list[Array]:
     if linear:
         # What is linear in its one series acts on each coefficient, whatever it is.
         if len(active) > 1:
-            raise _unsupported(name)
+            raise unsupported(name)
         return _termwise(eqn, vals)
     return _by_derivative(ring, eqn, vals)
 
@@ -153,14 +93,6 @@ def _termwise(eqn: Any, vals: list[Array]) -> list[Array]:
     terms = [_plain_any(eqn, [v[j:j + 1] if k == active else v for k, v in enumerate(vals)])
              for j in range(vals[active].shape[0])]  # fmt: skip
     return [xp_of(*parts).concatenate(parts) for parts in zip(*terms, strict=True)]
-
-
-def _unsupported(name: str, why: str = "") -> ValueError:
-    return ValueError(
-        f"the primitive '{name}' has no Taylor expansion here{why}: it was met in a pde, a boundary condition or a "
-        "kernel profile, applied to something that depends on x; rewrite it with elementary jax.numpy functions, or "
-        "give the quantity as values on the particles"
-    )
 
 
 def _plain_any(eqn: Any, vals: list[Array]) -> list[Array]:
@@ -182,7 +114,7 @@ def _plain_any(eqn: Any, vals: list[Array]) -> list[Array]:
         else:
             out = function(*args)
     except NotImplementedError as error:
-        raise _unsupported(eqn.primitive.name) from error
+        raise unsupported(eqn.primitive.name) from error
     return [v[None] if any(batched) else v[None, ..., None] for v in out]
 
 
@@ -194,10 +126,11 @@ def _by_derivative(ring: Ring, eqn: Any, vals: list[Array]) -> list[Array]:
     """
     active = tuple(k for k, v in enumerate(vals) if v.shape[0] > 1)
     starts = _apply(Ring(ring.dim, 0), eqn, [v[:1] for v in vals], False)
-    jaxpr, consts = _derivative(eqn, active)
+    jaxpr, consts = derivative(eqn, active)
     slopes_of = jaxpr.invars[len(vals):]
     moving = set(slopes_of)
-    still, going = [], []
+    still: list[tuple[Any, int]] = []
+    going: list[tuple[Any, int]] = []
     for eqn_, level in levels(jaxpr, [EVERYTHING] * len(jaxpr.outvars)):
         depends = any(not isinstance(v, Literal) and v in moving for v in eqn_.invars)
         (going if depends else still).append((eqn_, level))
@@ -218,76 +151,6 @@ def _by_derivative(ring: Ring, eqn: Any, vals: list[Array]) -> list[Array]:
         slope = next(slopes)
         out.append(integrate(ring, start, _literal(slope) if isinstance(slope, Literal) else env[slope]))
     return out
-
-
-def _derivative(eqn: Any, active: tuple[int, ...]) -> tuple[Any, Sequence[Any]]:
-    """The jaxpr (operands, tangents of the active ones) -> tangents of the inexact results."""
-    avals = tuple((v.aval.shape, v.aval.dtype) for v in eqn.invars)
-    try:
-        params = tuple(sorted(eqn.params.items()))
-        hash(params)
-    except TypeError:
-        return _trace_derivative(eqn, active)
-    return _cached_derivative(_Keyed((eqn.primitive, params, avals, bool(jax.config.jax_enable_x64)), eqn), active)
-
-
-class _Keyed:
-    """An operation that compares by what it computes."""
-
-    def __init__(self, key: Any, eqn: Any):
-        self.key, self.eqn = key, eqn
-
-    def __hash__(self) -> int:
-        return hash(self.key)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Keyed) and self.key == other.key
-
-
-@lru_cache(maxsize=512)
-def _cached_derivative(keyed: _Keyed, active: tuple[int, ...]) -> tuple[Any, Sequence[Any]]:
-    return _trace_derivative(keyed.eqn, active)
-
-
-def _trace_derivative(eqn: Any, active: tuple[int, ...]) -> tuple[Any, Sequence[Any]]:
-    exact = [not np.issubdtype(v.aval.dtype, np.inexact) for v in eqn.outvars]
-    operands = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in eqn.invars]
-
-    def tangents(args: Any, slopes: Any) -> list[Any]:
-        def some(*chosen: Any) -> list[Any]:
-            full = list(args)
-            for k, v in zip(active, chosen, strict=True):
-                full[k] = v
-            return bind(eqn, *full)
-
-        _, out = jax.jvp(some, [args[k] for k in active], slopes)
-        return [t for t, skip in zip(out, exact, strict=True) if not skip]
-
-    try:
-        closed = jax.make_jaxpr(tangents)(operands, [operands[k] for k in active])
-    except (NotImplementedError, TypeError, ValueError) as error:
-        raise _unsupported(eqn.primitive.name, f" ({error})" if "JVP" in str(error) else "") from error
-    # Calls are opened, so that the parts free of tangents can be told from the others.
-    closed = jax.make_jaxpr(lambda *a: inlined(closed.jaxpr, closed.consts, a))(*closed.in_avals)
-    return closed.jaxpr, closed.consts
-
-
-def inlined(jaxpr: Any, consts: Sequence[Any], args: Sequence[Any]) -> list[Any]:
-    """Perform a jaxpr on JAX values with its calls opened."""
-    env = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*consts, *args], strict=True))
-
-    def read(v: Any) -> Any:
-        return v.val if isinstance(v, Literal) else env[v]
-
-    for eqn in jaxpr.eqns:
-        vals = [read(v) for v in eqn.invars]
-        inner = called(eqn)
-        if inner is None:
-            out = bind(eqn, *vals)
-        else:
-            out = inlined(inner.jaxpr, inner.consts, vals[len(vals) - len(inner.jaxpr.invars):])
-        env.update(zip(eqn.outvars, out, strict=True))
-    return [read(v) for v in jaxpr.outvars]
 
 
 def evaluate(
@@ -325,8 +188,8 @@ def taylor_coefficients(function: Callable[..., Any], points: Any, degree: int, 
     ``multi_indices(D, degree)``; numpy where nothing is traced.
 
     >>> import jax.numpy as jnp, numpy as np
-    >>> taylor_coefficients(lambda x: jnp.sin(x[0]), np.zeros((1, 1)), 3)[:, 0].round(6).tolist()
-    [0.0, 1.0, 0.0, -0.166667]
+    >>> taylor_coefficients(lambda x: jnp.exp(x[0]), np.zeros((1, 1)), 2)[:, 0].tolist()
+    [1.0, 1.0, 0.5]
     """
     n, dim = np.shape(points)
     point = jax.ShapeDtypeStruct((dim,), points.dtype)

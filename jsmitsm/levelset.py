@@ -163,7 +163,7 @@ def checked(region: SdfRegion, boundary: Boundary) -> Boundary:
 
 def cells_near(region: SdfRegion, spacing: Spacing, fraction: float) -> tuple[packing.Cells, packing.Cells]:
     """Octree cells near the zero level, and the coarse ones around; raises for an empty domain."""
-    pad = 1.01 * region.size / packing._BASE[len(region.lo)]
+    pad = 1.01 * region.size / packing.BASE[len(region.lo)]
     cells, coarse = packing.refine(region, spacing, region.lo - pad, region.hi + pad, fraction, False)
     if not ((cells.distance < 0).any() or (coarse.distance < 0).any()):
         raise ValueError(

@@ -12,17 +12,21 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
 from jsmitsm.elementwise import ELEMENTWISE
-from jsmitsm.jets import EVERYTHING, bind, called, levels
+from jsmitsm.jaxprs import EVERYTHING, bind, called, levels, literal
 from jsmitsm.operators import Field, LocalField, Slot, field_p, frozen_p
 
 # What a value of the traced residual is to the point: the point itself, dependent on it, or not.
 POINT, DEPENDENT, FREE = 2, 1, 0
 # These forward a value when shape and dtype stay: the point stays the point.
-_FORWARDING = {"copy", "copy_p", "reshape", "broadcast_in_dim", "convert_element_type", "squeeze", "transpose",
-               "stop_gradient", "optimization_barrier", "name", "reduce_precision"}  # fmt: skip
+_FORWARDING = frozenset(
+    "copy copy_p reshape broadcast_in_dim convert_element_type squeeze transpose stop_gradient optimization_barrier "
+    "name reduce_precision".split()
+)
 # Linear in all their operands together: the tangents go through the operation itself.
-_LINEAR = {"neg", "sub", "add", "add_any", "reshape", "broadcast_in_dim", "squeeze", "expand_dims", "transpose", "slice",
-           "rev", "reduce_sum", "concatenate", "stack", "tile", "pad", "convert_element_type", "copy", "copy_p", "cumsum"}  # fmt: skip
+_LINEAR = frozenset(
+    "neg sub add add_any reshape broadcast_in_dim squeeze expand_dims transpose slice rev reduce_sum concatenate stack "
+    "tile pad convert_element_type copy copy_p cumsum".split()
+)
 
 
 def inner_jaxprs(eqn: Any) -> list[Jaxpr]:
@@ -43,7 +47,7 @@ def inner_jaxprs(eqn: Any) -> list[Jaxpr]:
     return found
 
 
-def slots_of(jaxpr: Jaxpr) -> set[Slot]:
+def slots_of(jaxpr: Any) -> set[Slot]:
     """The derivatives of the fields a jaxpr asks for."""
     out: set[Slot] = set()
     for eqn in jaxpr.eqns:
@@ -54,7 +58,7 @@ def slots_of(jaxpr: Jaxpr) -> set[Slot]:
     return out
 
 
-def check_points(jaxpr: Jaxpr, kinds: Sequence[int]) -> list[int]:
+def check_points(jaxpr: Any, kinds: Sequence[int]) -> list[int]:
     """Raise where a field is taken away from x, or a factor treated as constant is none."""
     env: dict[Any, int] = dict.fromkeys(jaxpr.constvars, FREE)
     env.update(zip(jaxpr.invars, kinds, strict=True))
@@ -117,18 +121,18 @@ def _check_control(eqn: Any, kinds: list[int]) -> None:
         )
 
 
-def open_fields(jaxpr: Jaxpr, consts: Sequence[Any], args: Sequence[Any], slots: dict[Slot, Any]) -> list[Any]:
+def open_fields(jaxpr: Any, consts: Sequence[Any], args: Sequence[Any], slots: dict[Slot, Any]) -> list[Any]:
     """Perform a jaxpr with its calls opened and the fields' derivatives taken from ``slots``.
 
     Equal operations are performed once: nested derivatives repeat the same values many times.
     """
     done: dict[Any, list[Any]] = {}
 
-    def walk(jaxpr: Jaxpr, consts: Sequence[Any], args: Sequence[Any], share: bool) -> list[Any]:
+    def walk(jaxpr: Any, consts: Sequence[Any], args: Sequence[Any], share: bool) -> list[Any]:
         env = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*consts, *args], strict=True))
 
         def read(v: Any) -> Any:
-            return np.asarray(v.val, v.aval.dtype) if isinstance(v, Literal) else env[v]
+            return literal(v) if isinstance(v, Literal) else env[v]
 
         for eqn, _ in levels(jaxpr, [EVERYTHING] * len(jaxpr.outvars)):
             vals = [read(v) for v in eqn.invars]
@@ -143,11 +147,9 @@ def open_fields(jaxpr: Jaxpr, consts: Sequence[Any], args: Sequence[Any], slots:
                 out = control(eqn, vals)
             else:
                 key = _key(eqn, vals) if share else None
-                out = done.get(key) if key is not None else None
-                if out is None:
-                    out = bind(eqn, *vals)
-                    if key is not None:
-                        done[key] = out
+                out = done[key] if key in done else bind(eqn, *vals)
+                if key is not None:
+                    done[key] = out
             env.update(zip(eqn.outvars, out, strict=True))
         return [read(v) for v in jaxpr.outvars]
 
@@ -193,7 +195,7 @@ def _key(eqn: Any, vals: list[Any]) -> Any:
     return eqn.primitive, params, operands, tuple(v.aval.shape for v in eqn.outvars)
 
 
-def tangents_of(jaxpr: Jaxpr, consts: Sequence[Any], args: Sequence[Any], seeds: dict[int, Any]) -> tuple[
+def tangents_of(jaxpr: Any, consts: Sequence[Any], args: Sequence[Any], seeds: dict[int, Any]) -> tuple[
     list[Any], list[dict[int, Any]]
 ]:
     """Results of a flat jaxpr and their derivatives with respect to some scalar inputs.
@@ -205,7 +207,7 @@ def tangents_of(jaxpr: Jaxpr, consts: Sequence[Any], args: Sequence[Any], seeds:
     slopes: dict[Any, dict[int, Any]] = {jaxpr.invars[k]: {k: one} for k, one in seeds.items()}
 
     def read(v: Any) -> Any:
-        return np.asarray(v.val, v.aval.dtype) if isinstance(v, Literal) else env[v]
+        return literal(v) if isinstance(v, Literal) else env[v]
 
     for eqn, _ in levels(jaxpr, [EVERYTHING] * len(jaxpr.outvars)):
         vals = [read(v) for v in eqn.invars]
@@ -298,7 +300,7 @@ class Record(NamedTuple):
     the residual (E,), then the coefficients (E,) named by ``outputs`` (None: zero).
     """
 
-    jaxpr: Jaxpr
+    jaxpr: Any
     consts: tuple[Any, ...]
     slots: tuple[Slot, ...]
     outputs: tuple[int | None, ...]
@@ -309,13 +311,13 @@ def record(
     residual: Callable[..., Any], field: Field | LocalField, extras: Sequence[tuple[int, ...]], params: Any
 ) -> Record:
     """Trace a residual once, and its derivatives with respect to every slot."""
-    dtype = jnp.zeros(0).dtype
+    dtype = jnp.result_type(float)
     point = jax.ShapeDtypeStruct((field.dim,), dtype)
     others = [jax.ShapeDtypeStruct(tuple(shape), dtype) for shape in extras]
     first = jax.make_jaxpr(lambda x, e, p: _values(residual(field, x, *e, *(() if params is None else (p,))), dtype))(
         point, others, params
     )
-    flat = first.jaxpr
+    flat: Any = first.jaxpr
     check_points(flat, [POINT] + [FREE] * (len(flat.invars) - 1))
     needed = [eqn for eqn, _ in levels(flat, [EVERYTHING])]
     slots = set()
@@ -326,8 +328,7 @@ def record(
             slots |= slots_of(inner)
     ordered = tuple(sorted(slots, key=_grade))
     scalars = [jax.ShapeDtypeStruct((), dtype)] * len(ordered)
-    rest = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in flat.invars[1:]]
-    consts = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in flat.constvars]
+    rest, consts = [_shaped(v) for v in flat.invars[1:]], [_shaped(v) for v in flat.constvars]
     second = jax.make_jaxpr(
         lambda x, s, r, c: open_fields(flat, c, [x, *r], dict(zip(ordered, s, strict=True)))
     )(point, scalars, rest, consts)
@@ -336,7 +337,7 @@ def record(
     def derivatives(*args: Any) -> list[Any]:
         seeds = {1 + k: np.ones((), dtype) for k in range(len(ordered))}
         (value,), (slopes,) = tangents_of(second.jaxpr, second.consts, args, seeds)
-        found = []
+        found: list[Any] = []
         for k in range(len(ordered)):
             slope = slopes.get(1 + k)
             outputs.append(None if slope is None else 1 + len(found))
@@ -344,15 +345,19 @@ def record(
                 found.append(slope)
         return [value, *found]
 
-    third = jax.make_jaxpr(derivatives)(*(jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in second.jaxpr.invars))
+    third = jax.make_jaxpr(derivatives)(*map(_shaped, second.jaxpr.invars))
     # The constants of the first trace are the last inputs of the third; make them constants again.
     n = len(flat.constvars)
-    jaxpr = third.jaxpr
+    jaxpr: Any = third.jaxpr
     jaxpr = jaxpr.replace(
         constvars=[*jaxpr.constvars, *jaxpr.invars[len(jaxpr.invars) - n:]],
         invars=jaxpr.invars[: len(jaxpr.invars) - n],
     )
     return Record(jaxpr, (*third.consts, *first.consts), ordered, tuple(outputs), flat.outvars[0].aval.shape[0])
+
+
+def _shaped(v: Any) -> jax.ShapeDtypeStruct:
+    return jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype)
 
 
 def _grade(slot: Slot) -> tuple[Any, ...]:
@@ -380,5 +385,5 @@ def _values(out: Any, dtype: Any) -> jax.Array:
             "did an operator or x keep an axis? (js.grad(u)(x) is a vector, js.laplacian(u)(x) a scalar)"
         )
     if not np.issubdtype(out.dtype, np.floating) and not np.issubdtype(out.dtype, np.integer):
-        raise ValueError(f"the residual must be real, got dtype {out.dtype}; write real and imaginary part as two equations")
+        raise ValueError(f"the residual must be real, got dtype {out.dtype}; write its two parts as two equations")
     return out.astype(dtype).reshape(-1)

@@ -11,10 +11,8 @@ a gradient, a Hessian or a vmap over right-hand sides costs one factorisation in
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Sequence
 from copy import deepcopy
-from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
@@ -25,8 +23,8 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
 from jsmitsm.errors import SolveError
+from jsmitsm.factorcache import Settings, clear_cache, factorisations, lookup
 from jsmitsm.sparse import (
-    COUNTS,
     DENSE_MAX,
     Factor,
     SingularMatrix,
@@ -91,6 +89,9 @@ def solve(
       SingularMatrix: a singular or not finite system, naming the unknowns. Under jit nothing is
         raised: x is NaN.
 
+    Under jit let `rows` and `cols` be arguments rather than constants of the compiled function:
+    millions of constants take seconds to compile.
+
     Example:
       >>> import numpy as np
       >>> rows, cols = np.array([0, 0, 1]), np.array([0, 1, 1])
@@ -103,9 +104,11 @@ def solve(
         points = None
     points = _check(data, rows, cols, b, n, points, solver)
     dtype = jnp.result_type(data, b, float)
+    if n == 0:
+        return jnp.asarray(b, dtype)
     if not traced:
         _refuse_nonfinite(np.asarray(b))
-        found, cached = _lookup((data, rows, cols), _Settings(n, points, solver, elliptic, refine))
+        found, cached = lookup((data, rows, cols), Settings(n, points, solver, elliptic, refine))
         x = found.solve(b)
         if info is not None:
             info.update(deepcopy(found.info), cached=cached)
@@ -114,7 +117,7 @@ def solve(
     wide = b[:, None] if b.ndim == 1 else b
     if solver == "dense":
         return _dense(data, rows, cols, wide, n=n).reshape(b.shape)
-    settings = _Settings(n, points, solver, elliptic, refine)
+    settings = Settings(n, points, solver, elliptic, refine)
     x = solve_p.bind(data, rows, cols, wide, settings=settings, transpose=False)
     return x.reshape(b.shape)
 
@@ -177,61 +180,6 @@ def _assemble_and_solve(data: Any, rows: Any, cols: Any, b: Any, n: int) -> jax.
 _dense = jax.jit(_assemble_and_solve, static_argnames="n")
 
 
-# -------------------------------------------------------------------------------- factorisations
-
-
-@dataclass(frozen=True)
-class _Settings:
-    """What a factorisation depends on besides the entries; hashable, a primitive's parameter."""
-
-    n: int
-    points: np.ndarray | None = field(repr=False)
-    solver: str
-    elliptic: bool
-    refine: int
-
-    def __hash__(self) -> int:
-        return hash((self.n, self.solver, self.elliptic, self.refine))
-
-    def __eq__(self, other: object) -> bool:
-        return (
-            isinstance(other, _Settings)
-            and hash(self) == hash(other)
-            and (self.n, self.solver) == (other.n, other.solver)
-            and (self.elliptic, self.refine) == (other.elliptic, other.refine)
-            and _same(self.points, other.points)
-        )
-
-
-def _same(a: Any, b: Any) -> bool:
-    """Whether two arrays hold the same values (NaN equals NaN)."""
-    if a is b:
-        return True
-    if a is None or b is None or a.shape != b.shape:
-        return False
-    a, b = np.asarray(a), np.asarray(b)
-    step = max(1, len(a) // 32)  # a glance first: most arrays that differ, differ there
-    nan = a.dtype.kind == "f"
-    return np.array_equal(a[::step], b[::step], nan) and np.array_equal(a, b, nan)
-
-
-@dataclass(eq=False)
-class _Entry:
-    """A kept factorisation and the arrays it was made of."""
-
-    arrays: tuple[Any, ...]
-    settings: _Settings
-    factor: Factor
-
-    def same_pattern(self, arrays: Sequence[Any], settings: _Settings) -> bool:
-        return settings == self.settings and all(map(_same, arrays[1:], self.arrays[1:]))
-
-
-_cache: list[_Entry] = []  # the last one used stands last
-_lock = threading.Lock()
-CACHE_ENTRIES, CACHE_BYTES = 64, 2**30
-
-
 def factor(
     data: Any,
     rows: Any,
@@ -252,42 +200,7 @@ def factor(
       True
     """
     points = _check(data, rows, cols, np.zeros(n), n, points, solver)
-    return _lookup((data, rows, cols), _Settings(n, points, solver, elliptic, refine))[0]
-
-
-def clear_cache() -> None:
-    """Forget every kept factorisation and so free its memory."""
-    with _lock:
-        _cache.clear()
-
-
-def factorisations() -> int:
-    """Number of factorisations made so far in this process."""
-    return COUNTS["factorisations"]
-
-
-def _lookup(arrays: Sequence[Any], settings: _Settings) -> tuple[Factor, bool]:
-    """The factorisation of (data, rows, cols), and whether it was kept."""
-    order = None
-    with _lock:
-        for entry in reversed(_cache):
-            if entry.same_pattern(arrays, settings):
-                if _same(arrays[0], entry.arrays[0]):
-                    _cache.remove(entry)
-                    _cache.append(entry)
-                    return entry.factor, True
-                order = entry.factor.order
-    s = settings
-    data, rows, cols = arrays
-    made = Factor(data, rows, cols, s.n, s.points, s.solver, s.elliptic, s.refine, order)
-    # A numpy array may be changed in place after this call; a JAX array cannot.
-    kept = tuple(a if isinstance(a, jax.Array) else np.array(a) for a in arrays)
-    with _lock:
-        _cache.append(_Entry(kept, settings, made))
-        total = sum(entry.factor.nbytes for entry in _cache)
-        while len(_cache) > 1 and (len(_cache) > CACHE_ENTRIES or total > CACHE_BYTES):
-            total -= _cache.pop(0).factor.nbytes
-    return made, False
+    return lookup((data, rows, cols), Settings(n, points, solver, elliptic, refine))[0]
 
 
 # ------------------------------------------------------------------------------------- primitive
@@ -302,23 +215,23 @@ def _batched(data: Any, rows: Any, cols: Any) -> bool:
     return max(data.ndim, rows.ndim, cols.ndim) > 1
 
 
-def _on_host(arrays: Sequence[Any], b: Any, settings: _Settings, transpose: bool) -> np.ndarray:
+def _on_host(arrays: Sequence[Any], b: Any, settings: Settings, transpose: bool) -> np.ndarray:
     """Solve concrete arrays, batch element by batch element."""
     if not _batched(*arrays):
-        return _lookup(arrays, settings)[0].solve(b, transpose).astype(b.dtype)
+        return lookup(arrays, settings)[0].solve(b, transpose).astype(b.dtype)
     arrays, b = [np.asarray(a) for a in arrays], np.asarray(b)
     out = np.empty(b.shape, b.dtype)
     for k in range(b.shape[0]):
         one = [a[k] if a.ndim > 1 else a for a in arrays]
-        out[k] = _lookup(one, settings)[0].solve(b[k], transpose)
+        out[k] = lookup(one, settings)[0].solve(b[k], transpose)
     return out
 
 
-def _impl(data: Any, rows: Any, cols: Any, b: Any, *, settings: _Settings, transpose: bool) -> Any:
+def _impl(data: Any, rows: Any, cols: Any, b: Any, *, settings: Settings, transpose: bool) -> Any:
     return jnp.asarray(_on_host((data, rows, cols), b, settings, transpose))
 
 
-def _jvp(primals: Any, tangents: Any, *, settings: _Settings, transpose: bool) -> Any:
+def _jvp(primals: Any, tangents: Any, *, settings: Settings, transpose: bool) -> Any:
     """dx = A^-1 (db - dA x)."""
     data, rows, cols, b = primals
     d_data, _, _, d_b = tangents
@@ -335,7 +248,7 @@ def _jvp(primals: Any, tangents: Any, *, settings: _Settings, transpose: bool) -
 
 
 def _transpose(
-    ct: Any, data: Any, rows: Any, cols: Any, b: Any, *, settings: _Settings, transpose: bool
+    ct: Any, data: Any, rows: Any, cols: Any, b: Any, *, settings: Settings, transpose: bool
 ) -> Any:
     """b_bar = A^-T x_bar."""
     if ad.is_undefined_primal(data):
@@ -346,7 +259,7 @@ def _transpose(
     return [None, None, None, back]
 
 
-def _batch(args: Any, axes: Any, *, settings: _Settings, transpose: bool) -> Any:
+def _batch(args: Any, axes: Any, *, settings: Settings, transpose: bool) -> Any:
     """Several right-hand sides are one wide one; several matrices are solved in turn."""
     size = next(a.shape[k] for a, k in zip(args, axes) if k is not None)
     bind = partial(solve_p.bind, settings=settings, transpose=transpose)
@@ -387,7 +300,7 @@ def _scatter(data: Any, rows: Any, cols: Any, x: Any) -> Any:
 
 
 def _lower(
-    ctx: Any, data: Any, rows: Any, cols: Any, b: Any, *, settings: _Settings, transpose: bool
+    ctx: Any, data: Any, rows: Any, cols: Any, b: Any, *, settings: Settings, transpose: bool
 ) -> Any:
     """Under jit: small systems in plain JAX, the others by a call back to the host.
 

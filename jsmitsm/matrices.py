@@ -71,7 +71,7 @@ def _cholesky(ring: Ring, eqn: Any, a: Array) -> Array:
     columns: list[Array] = []
     for j in range(n):
         v = a[..., j:, j, :]
-        for k, c in enumerate(columns):
+        for c in columns:
             v = _sub(v, mul(ring, c[..., j:, :], c[..., j:j + 1, :]))
         pivot = v[..., :1, :]
         start = xp_of(v).sqrt(pivot[:1])

@@ -269,6 +269,42 @@ def _collocated(scheme, near, solution, own, data, tests):
     return -w, v, v_own, others / jnp.where(own_weight > 0, own_weight, 1.0), defect, system
 
 
+class Block(NamedTuple):
+    """A particle's part of the least-squares form, sum_i |(I - A A^+) sqrt(W) (u - P U_part)|^2.
+
+    matrix (m, m) and load (m,) over the fit's data: values of the neighbours, the particle
+    itself first, then their conditions.
+    """
+
+    matrix: Any
+    load: Any
+
+
+def block(
+    scheme: Scheme, near: Support, solution: Elimination, own: Any, data: Any, source: Any, given: Any
+) -> Block:
+    """The least-squares misfit of the particle's local fit as a quadratic form of its data."""
+    system = local_system(scheme, near, solution, own, data, None, skip_self=False)
+    part = particular_part(scheme, solution, system, source, given)
+    root = jnp.sqrt(system.weight)
+    a = root[:, None] * system.phi
+    misfit = jnp.diag(system.weight) - root[:, None] * (a @ solve_gram(a, gram_inverse(a), a.T)) * root
+    # Physical data are scaled like the unknowns inside the fit.
+    ns, fields = near.weight.shape[0], scheme.rec.fields
+    power = near.length ** jnp.asarray(scheme.rec.weights, near.length.dtype)
+    scale = jnp.concatenate([jnp.tile(power, ns), system.data_scale.reshape(-1)])
+    return Block(scale[:, None] * misfit * scale, scale * (misfit @ (system.values @ part)))
+
+
+def particular_part(scheme: Scheme, solution: Elimination, system: System, source: Any, given: Any) -> Any:
+    """The scaled U (F K,) that meets the recursion and the particle's own conditions."""
+    part = solution.particular @ (solution.lift * source)
+    if scheme.n_own and scheme.method != "SSPH":
+        lack = system.own_scale * given - system.own_rows @ part
+        part = part + solution.basis @ (system.own_solve @ lack)
+    return part
+
+
 def coefficients(
     scheme: Scheme, near: Support, solution: Elimination, own: Any, data: Any, tests: Any,
     values: Any, source: Any, given: Any,
@@ -283,13 +319,9 @@ def coefficients(
     system = local_system(scheme, near, solution, own, data, tests, skip_self=not collocated)
     ns = near.weight.shape[0]
     power = near.length ** jnp.asarray(rec.weights, near.length.dtype)
-    given = jnp.zeros(0) if given is None else given
     scaled = (values[: ns * fields].reshape(ns, fields) * power).reshape(-1)
     scaled = jnp.concatenate([scaled, values[ns * fields :] * system.data_scale.reshape(-1)])
-    part = solution.particular @ (solution.lift * source)
-    if scheme.n_own and not collocated:
-        lack = system.own_scale * given - system.own_rows @ part
-        part = part + solution.basis @ (system.own_solve @ lack)
+    part = particular_part(scheme, solution, system, source, given)
     rest = scaled - system.values @ part
     if system.tests is None:
         a = jnp.sqrt(system.weight)[:, None] * system.phi

@@ -22,10 +22,12 @@ _NEIGHBOURS = {2: 8, 3: 14}
 # there are more of them on the fine side. This weight of the neighbour's spacing stops the drift (found by trial).
 _LEAN = {2: 0.6, 3: 0.75}
 # Base cells along the longest side: what decides how small a part of the domain is noticed at all.
-_BASE = {1: 256, 2: 48, 3: 20}
+BASE = {1: 256, 2: 48, 3: 20}
 # A new particle goes where an empty ball has more than this many spacings as radius; 0.58 is a gap between hexagons.
 _HOLE = 0.85
 _PROBES = 6
+# Cells of an octree before it is taken for a mistake in the spacing.
+_MOST = 30_000_000
 # No interior particle comes closer to the boundary than this many spacings.
 CLEARANCE = 0.5
 
@@ -85,7 +87,7 @@ def refine(
     coarse ones left behind. ``base`` is the width to start from, chosen here where it is 0.
     """
     dim = len(lo)
-    width = base or float((hi - lo).max()) / _BASE[dim]
+    width = base or float((hi - lo).max()) / BASE[dim]
     counts = np.maximum(np.ceil((hi - lo) / width - 1e-9).astype(int), 1)
     start = (lo + hi) / 2 - counts * width / 2
     index = np.stack(np.meshgrid(*map(np.arange, counts), indexing="ij"), axis=-1).reshape(-1, dim)
@@ -106,15 +108,18 @@ def refine(
         cells = Cells(centers, np.full(len(centers), width), distance, outward, h)
         left.append(_take(cells, ~wanted))
         done.append(_take(cells, wanted & (width <= fraction * h * (1 + 1e-9))))
-        split = centers[wanted & (width > fraction * h * (1 + 1e-9))]
+        split = wanted & (width > fraction * h * (1 + 1e-9))
+        # Near the boundary a split cell leaves about 2^(D - 1) behind, inside 2^D.
+        needed = float(((width / (fraction * h[split])) ** (dim if inside else dim - 1)).sum())
+        if needed > _MOST:
+            raise ValueError(
+                f"spacing: as small as {h[split].min():.3g} in a domain of size {(hi - lo).max():.3g} it takes about "
+                f"{needed:.2g} cells, more than {_MOST:.0e}; enlarge it, or narrow the bounds if they are far too wide"
+            )
+        split = centers[split]
         centers = (split[:, None] + width * children).reshape(-1, dim)
         changes = np.zeros(len(centers), bool)
         width /= 2
-        if len(centers) > 20_000_000:
-            raise ValueError(
-                f"spacing: needs more than {len(centers)} cells of width {width:.3g} in a domain of size "
-                f"{(hi - lo).max():.3g}; enlarge the spacing, or narrow the bounds if they are far too wide"
-            )
     return _join(done), _join(left)
 
 
@@ -192,7 +197,7 @@ def _scatter(
     base = 0.0
     if uniform:  # cells of exactly one particle: the start is a jittered lattice
         base = fraction * float(spacing(lo[None])[0])
-        base *= 2.0 ** max(0.0, np.floor(np.log2((hi - lo).max() / _BASE[dim] / base)))
+        base *= 2.0 ** max(0.0, np.floor(np.log2((hi - lo).max() / BASE[dim] / base)))
     shift = rng.uniform(0.0, 0.5, dim) * fraction * spacing_at_most(spacing, lo, hi, uniform)
     cells, _ = refine(region, spacing, lo - shift, hi + shift, fraction, True, base)
     order = np.argsort(morton(cells.centers, lo, hi), kind="stable")

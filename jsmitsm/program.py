@@ -24,13 +24,14 @@ def kept(key: Any, make: Callable[[], Any]) -> Any:
     return _programs[key]
 
 
-def fingerprint(jaxpr: Jaxpr) -> Any:
+def fingerprint(jaxpr: Any) -> Any:
     """A hashable value, equal for jaxprs that compute the same in the same way."""
     number: dict[Any, int] = {}
 
     def name(v: Any) -> Any:
         if isinstance(v, Literal):
-            value = np.asarray(v.val, v.aval.dtype)
+            aval: Any = v.aval
+            value = np.asarray(v.val, aval.dtype)
             return value.dtype.str, value.tobytes()
         return number.setdefault(v, len(number))
 

@@ -268,8 +268,9 @@ def rotate(shape: Sdf, angle: Any, center: Any = None, axis: Any = None) -> Sdf:
     Raises ValueError, when called, for a 3D point without an axis and for a 2D one with it.
 
     >>> import jax.numpy as jnp, jsmitsm as js
-    >>> round(float(js.sdf.rotate(js.sdf.rectangle((0, 0), (2, 1)), jnp.pi / 2)(jnp.array([-0.5, 1.0]))), 12)
-    -0.5
+    >>> upright = js.sdf.rotate(js.sdf.rectangle((0, 0), (2, 1)), jnp.pi / 2)
+    >>> print(f"{upright(jnp.array([-0.5, 1.0])):.3f}")
+    -0.500
     """
     middle = 0.0 if center is None else _vector("center", center)
     direction = None if axis is None else _vector("axis", axis, 3)

@@ -14,7 +14,8 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from jsmitsm.taylor import block_rows, count, degree_of_count, degrees, product_pairs, product_rows
+from jsmitsm.pairing import pairing, product
+from jsmitsm.taylor import block_rows, count, degree_of_count, degrees, product_rows
 
 Array = Any
 
@@ -96,7 +97,7 @@ def mul(ring: Ring, x: Array, y: Array) -> Array:
     left, right = degree_of(ring, x), degree_of(ring, y)
     degree = min(left + right, ring.degree)
     if not on_host(x, y):
-        return _pair_sum(x, y, *product_pairs(ring.dim, left, right, 0, degree))
+        return pairing(x, y, product(ring.dim, left, right, 0, degree))
     shape = np.broadcast_shapes(x.shape[1:], y.shape[1:])
     out = np.zeros((count(ring.dim, degree), *shape), np.result_type(x, y))
     for a, (n, places) in enumerate(product_rows(ring.dim, left, right, degree)):
@@ -105,30 +106,27 @@ def mul(ring: Ring, x: Array, y: Array) -> Array:
     return out
 
 
-def _pair_sum(x: Array, y: Array, left: np.ndarray, right: np.ndarray) -> Array:
-    """Sum over the pairs of each row; one gather and one reduction compile quickly."""
-    return (pad_to(x, x.shape[0] + 1)[left] * pad_to(y, y.shape[0] + 1)[right]).sum(1)
-
-
 def block(ring: Ring, x: Array, degree: int) -> Array:
     """The coefficients of exactly this degree."""
     return x[count(ring.dim, degree - 1): count(ring.dim, degree)]
 
 
-def product_block(ring: Ring, x: Array, y: Array, degree: int, first: int = 1) -> Array:
-    """Degree ``degree`` of x y, from x's terms of degree at least ``first`` and those of y at hand."""
+def product_block(ring: Ring, x: Array, y: Array, degree: int, first: int = 1, weighted: bool = False) -> Array:
+    """Degree ``degree`` of x y, from x's terms of degree at least ``first`` and those of y at hand.
+
+    ``weighted``: of E(x) y instead, E the Euler operator below.
+    """
     dim = ring.dim
     left, right = min(degree_of(ring, x), degree), min(degree_of(ring, y), degree)
-    shape = np.broadcast_shapes(x.shape[1:], y.shape[1:])
-    rows = count(dim, degree) - count(dim, degree - 1)
     if not on_host(x, y):
-        if first:
-            x = jnp.concatenate([jnp.zeros_like(x[:1]), x[1:]])
-        pairs = product_pairs(dim, left, right, degree, degree)
-        return _pair_sum(x[: count(dim, left)], y[: count(dim, right)], *pairs)
-    out = np.zeros((rows, *shape), np.result_type(x, y))
+        pairs = product(dim, left, right, degree, degree, first, weighted)
+        return pairing(x[: count(dim, left)], y[: count(dim, right)], pairs)
+    shape = np.broadcast_shapes(x.shape[1:], y.shape[1:])
+    out = np.zeros((count(dim, degree) - count(dim, degree - 1), *shape), np.result_type(x, y))
     for j in range(max(first, degree - right), left + 1):
         a, b = block(ring, x, j), block(ring, y, degree - j)
+        if weighted:
+            a = a * x.dtype.type(j)
         if len(a) > len(b):
             a, b = b, a
             table = block_rows(dim, degree - j, j)
@@ -200,10 +198,10 @@ def div(ring: Ring, x: Array, y: Array) -> Array:
 def power(ring: Ring, x: Array, r: Array, start: Array) -> Array:
     """x**r for an exponent independent of x, from x E(w) = r w E(x); ``start`` is x0**r."""
     x, r, start = align(x, r, start)
-    slope, x0 = euler(ring, x), x[:1]
+    x0 = x[:1]
 
     def step(k: int, w: list[Array]) -> list[Array]:
-        right = r * product_block(ring, slope, w[0], k)
+        right = r * product_block(ring, x, w[0], k, weighted=True)
         left = product_block(ring, x, euler(ring, w[0]), k) if k > 1 else 0.0
         return [(right - left) / (k * x0)]
 
@@ -228,7 +226,6 @@ def integer_power(ring: Ring, x: Array, n: int) -> Array:
 
 def riccati(ring: Ring, x: Array, start: Array, c0: float, c1: float, c2: float) -> Array:
     """w(x) with dw/dx = c0 + c1 w + c2 w^2: exp, tan, tanh, logistic and their kin."""
-    slope = euler(ring, x)
 
     def rate(k: int, w: Array, last: Array) -> Array:
         """Degree k of c0 + c1 w + c2 w^2."""
@@ -239,7 +236,7 @@ def riccati(ring: Ring, x: Array, start: Array, c0: float, c1: float, c2: float)
 
     def step(k: int, state: list[Array]) -> list[Array]:
         w, h = state
-        new = product_block(ring, slope, h, k) / k
+        new = product_block(ring, x, h, k, weighted=True) / k
         if k == ring.degree:
             return [new, new]  # the last rate is not asked for
         return [new, rate(k, xp_of(w, new).concatenate([w, new]), new)]
@@ -250,11 +247,11 @@ def riccati(ring: Ring, x: Array, start: Array, c0: float, c1: float, c2: float)
 
 def circle(ring: Ring, x: Array, sine: Array, cosine: Array, sign: float) -> tuple[Array, Array]:
     """(sin, cos) of x for sign -1, (sinh, cosh) for +1, together."""
-    slope = euler(ring, x)
 
     def step(k: int, state: list[Array]) -> list[Array]:
         s, c = state
-        return [product_block(ring, slope, c, k) / k, sign * product_block(ring, slope, s, k) / k]
+        sine = product_block(ring, x, c, k, weighted=True) / k
+        return [sine, sign * product_block(ring, x, s, k, weighted=True) / k]
 
     s, c = recursion(ring, [_like_product(sine, x), _like_product(cosine, x)], step)
     return s, c

@@ -190,7 +190,8 @@ def _gather(ring: Ring, eqn: Any, x: Array, indices: Array) -> Array:
     dims = p["dimension_numbers"]
     mode = str(p["mode"])
     places, valid = _gather_places(
-        x.shape[1:-1], len(shape), indices, tuple(map(int, dims.offset_dims)), tuple(map(int, dims.collapsed_slice_dims)),
+        x.shape[1:-1], len(shape), indices,
+        tuple(map(int, dims.offset_dims)), tuple(map(int, dims.collapsed_slice_dims)),
         tuple(map(int, dims.start_index_map)), tuple(map(int, dims.operand_batching_dims)),
         tuple(map(int, dims.start_indices_batching_dims)), p["slice_sizes"], "FILL" not in mode,
     )  # fmt: skip
@@ -231,7 +232,8 @@ def _scatter(ring: Ring, eqn: Any, x: Array, indices: Array, updates: Array) -> 
         if eqn.primitive.name == "scatter":
             flat[:, places] = new
         else:
-            np.add.at(flat, (slice(None), places), new)
+            for k, place in enumerate(places):
+                flat[:, place] += new[:, k]
     else:
         at = jnp.asarray(flat).at[:, places]
         flat = at.set(new) if eqn.primitive.name == "scatter" else at.add(new)
@@ -387,7 +389,7 @@ def _series_dot(ring: Ring, x: Array, y: Array, names: list[str], out: str, summ
 
 
 MOVEMENT = frozenset(
-    "reshape squeeze expand_dims broadcast_in_dim tile transpose rev slice split concatenate stack unstack pad dynamic_slice "
-    "dynamic_update_slice gather copy copy_p reduce_precision optimization_barrier name".split()
+    "reshape squeeze expand_dims broadcast_in_dim tile transpose rev slice split concatenate stack unstack pad "
+    "dynamic_slice dynamic_update_slice gather copy copy_p reduce_precision optimization_barrier name".split()
 )
 __all__ = ["MOVEMENT", "RULES"]

@@ -108,6 +108,15 @@ class Solution:
         values = _evaluate(b, self.order, self.cloud.points, self._taylor, points, near, weight)
         return values[:, 0] if self._recipe.fields == 1 else values
 
+    def error_estimate(self) -> Any:
+        """Estimated error |u - u_exact| at every particle, (N,) or (N, F); see :mod:`jsmitsm.estimate`.
+
+        Computed when asked for: one more assembly at order p + 2 and one solve with the kept factors.
+        """
+        from jsmitsm.estimate import error_estimate
+
+        return error_estimate(self)
+
     def diagnose(self) -> str:
         """In words: how the solve went, which particles were weak and what was done."""
         s = self.stats

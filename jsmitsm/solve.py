@@ -108,8 +108,10 @@ def solve(
     start = time.perf_counter()
     _check(problem, cloud, method, order, kernel, stencils, formulation, solver)
     disc = dz.discretize(problem, cloud, method, order, kernel, stencils, basis_terms)
-    run = Run(disc, problem, solver, throw, repair=kernel is None and stencils is None)
+    run = Run(disc, problem, solver, throw, kernel is None and stencils is None, formulation)
     run.seconds["set-up"] = time.perf_counter() - start
+    if formulation == "lsq" and method != "S":
+        raise ValueError(f'formulation: "lsq" is a form of method S, not of {method!r}; use method="S" or "loo"')
     if not disc.classes:
         raise ValueError("problem: every particle's value is held; nothing is left to solve for")
     if disc.linear:
@@ -122,6 +124,15 @@ def solve(
     recipe = Recipe(method, order, basis_terms, formulation, problem.fields)
     fit = Fit(problem, cloud, disc.kernel, dz.table(disc), taylor, recipe)
     return Solution(values, cloud, recipe, fit, good, iterations, run.stats())
+
+
+def discretized(
+    problem: Problem, cloud: Cloud, method: str = "S", order: int = 4, kernel: Kernel | None = None,
+    stencils: Stencils | None = None,
+) -> Discretization:  # fmt: skip
+    """Checked arguments, discretised."""
+    _check(problem, cloud, method, order, kernel, stencils, "auto", "auto")
+    return dz.discretize(problem, cloud, method, order, kernel, stencils, None)
 
 
 def _check(problem, cloud, method, order, kernel, stencils, formulation, solver) -> None:
@@ -140,5 +151,5 @@ def _check(problem, cloud, method, order, kernel, stencils, formulation, solver)
     ):  # fmt: skip
         if value not in known:
             raise ValueError(f"{name}: {value!r} is none of {', '.join(map(repr, known))}")
-    if isinstance(order, bool) or not isinstance(order, (int, np.integer)) or not 1 <= order <= 12:
-        raise ValueError(f"order: expected a whole number from 1 to 12, the degree of the expansions, got {order!r}")
+    if isinstance(order, bool) or not isinstance(order, (int, np.integer)) or not 1 <= order <= 14:
+        raise ValueError(f"order: expected a whole number from 1 to 14, the degree of the expansions, got {order!r}")

@@ -41,13 +41,14 @@ def estimate_memory(n: int, nnz: int, dim: int) -> int:
     """Bytes the direct solver needs for n unknowns and nnz entries in `dim` dimensions, roughly.
 
     Fitted to nested dissection of meshless matrices with 12 to 100 entries a row (1e4 to 4e5
-    unknowns in 2D, 4e3 to 5e4 in 3D), within some 30%: with s = nnz / n entries a row, the factors
-    have n s (1.3 log2 n - 8) entries in 2D and 0.45 n^1.45 s^0.9 in 3D, of 18 bytes each at the
-    peak. The iterative solver needs about 60 bytes for every entry of the matrix instead.
+    unknowns in 2D, 4e3 to 5e4 in 3D), within some 25%: with s = nnz / n entries a row, the factors
+    have n s (1.3 log2 n - 8) entries in 2D and 0.45 n^1.45 s^0.9 in 3D, of 12 bytes each, and the
+    matrix and its copies take 50 bytes an entry. The iterative solver needs no more than about 70
+    bytes for every entry of the matrix.
 
     Example:
       >>> round(estimate_memory(102_400, 2_037_720, 2) / 1e6)
-      622
+      447
     """
     n, per_row = max(int(n), 2), nnz / max(int(n), 1)
     if dim >= 3:
@@ -56,7 +57,7 @@ def estimate_memory(n: int, nnz: int, dim: int) -> int:
         fill = n * per_row * max(1.3 * np.log2(n) - 8.0, 2.0)
     else:
         fill = 3.0 * nnz
-    return int(18 * min(fill, float(n) * n) + 60 * nnz)
+    return int(12 * min(fill, float(n) * n) + 50 * nnz)
 
 
 class Factor:
@@ -141,7 +142,7 @@ class Factor:
     @property
     def nbytes(self) -> int:
         """Bytes held, roughly."""
-        return 24 * self.matrix.nnz + 14 * int(self.info.get("factor_entries", 0))
+        return 60 * self.matrix.nnz + 14 * int(self.info.get("factor_entries", 0))
 
     def solve(self, b: Any, transpose: bool = False) -> np.ndarray:
         """Solution of A x = b, or of A^T x = b: (n,) or (n, m), like `b`.

@@ -7,6 +7,8 @@ import numpy as np
 from jsmitsm import levelset, packing
 from jsmitsm.packing import Spacing
 
+_CORNER = np.cos(np.deg2rad(8.0))  # sides whose normals differ by more meet in an edge
+
 
 def surface(region: levelset.SdfRegion, spacing: Spacing, seed: int) -> levelset.Boundary:
     """The zero level in 3D: foot points of small cells, thinned, relaxed on the surface, holes filled."""
@@ -99,16 +101,24 @@ def _refill(points: np.ndarray, feet: np.ndarray, h: np.ndarray) -> np.ndarray:
 
 
 def _surface_normals(region: levelset.SdfRegion, points: np.ndarray, h: np.ndarray) -> np.ndarray:
-    """Unit gradients; on an edge or a corner, the normalised mean of those on its sides."""
+    """Unit gradients; on an edge or a corner, the normalised sum of those of its two or three sides."""
     normal = region.normals(points)
     across = np.cross(normal, np.eye(3)[np.abs(normal).argmin(axis=1)])
     across /= np.linalg.norm(across, axis=1, keepdims=True)
     other = np.cross(normal, across)
-    total = np.zeros_like(normal)
-    small = 1e-6 * h[:, None]
-    for u, v in ((1, 0), (-1, 0), (0, 1), (0, -1)):
-        total += region.distance(points + small * (u * across + v * other - normal))[1]
-    mean = total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-300)
-    edge = np.einsum("md,md->m", mean, normal) < 1 - 1e-6
-    edge |= np.linalg.norm(total, axis=1) < 4 * (1 - 1e-6)
-    return np.where(edge[:, None], mean, normal)
+    # A ring of probes just below the surface sees all sides that meet here, whatever the gradient at the edge itself.
+    sides = []
+    for angle in np.arange(8) * np.pi / 4:
+        ring = np.cos(angle) * across + np.sin(angle) * other
+        sides.append(region.distance(points + 1e-5 * h[:, None] * (0.7 * ring - 0.3 * normal))[1])
+    seen = np.stack(sides)  # (8, M, 3)
+    total, row = seen[0], np.arange(len(points))
+    likeness = np.einsum("kmd,md->km", seen, seen[0])
+    edge = likeness.min(axis=0) < _CORNER
+    for _ in range(2):
+        which = likeness.argmin(axis=0)
+        new = likeness[which, row] < _CORNER
+        total = total + np.where(new[:, None], seen[which, row], 0.0)
+        likeness = np.maximum(likeness, np.einsum("kmd,md->km", seen, seen[which, row]))
+    length = np.linalg.norm(total, axis=1, keepdims=True)
+    return np.where(edge[:, None] & (length > 1e-6), total / np.maximum(length, 1e-300), normal)

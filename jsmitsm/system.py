@@ -23,9 +23,10 @@ COMPATIBLE = 1e-6
 class Run:
     """One call of ``solve``: the discretisation, its options, and what happened."""
 
-    def __init__(self, disc: Discretization, problem: Problem, solver: str, throw: bool, repair: bool):
+    def __init__(self, disc: Discretization, problem: Problem, solver: str, throw: bool, repair: bool, formulation: str):
         self.disc, self.problem = disc, problem
         self.solver, self.throw, self.repair = solver, throw, repair
+        self.formulation = formulation
         self.seconds: dict[str, float] = {"local": 0.0, "assembly": 0.0, "solve": 0.0}
         self.messages: list[str] = []
         self.linear: dict[str, Any] = {}
@@ -76,11 +77,17 @@ class Run:
         """Assemble and solve one linear system: values (N, F), and whether it went well."""
         clock, disc = time.perf_counter, self.disc
         t0 = clock()
-        classes, rows = self.local_rows(nums)
-        t1 = clock()
-        data, r, c = dz.matrix(disc, classes, rows)
-        b = dz.right_side(disc, nums, classes, rows)
-        t2 = clock()
+        if self.formulation == "auto":
+            self.formulation = "lsq" if dz.prefers_least_squares(disc, nums) else "loo"
+        if self.formulation == "lsq":
+            data, r, c, b = dz.least_squares(disc, nums)
+            t1 = t2 = clock()
+        else:
+            classes, rows = self.local_rows(nums)
+            t1 = clock()
+            data, r, c = dz.matrix(disc, classes, rows)
+            b = dz.right_side(disc, nums, classes, rows)
+            t2 = clock()
         x, good = self.solved(data, r, c, b)
         values = dz.with_held(disc, nums, x)
         for name, took in (("local", t1 - t0), ("assembly", t2 - t1), ("solve", clock() - t2)):
@@ -148,6 +155,7 @@ class Run:
             "unknowns": int((~disc.held).sum()),
             "neighbours": max((c.neighbours.shape[1] for c in disc.classes), default=0),
             "linear": self.linear,
+            "formulation": self.formulation,
             "skipped": skipped(disc),
             "messages": list(self.messages),
         }

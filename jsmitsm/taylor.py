@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from functools import lru_cache
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ import numpy as np
 MultiIndex = tuple[int, ...]
 
 
-@lru_cache(maxsize=None)
+@cache
 def multi_indices(dim: int, degree: int) -> tuple[MultiIndex, ...]:
     """All multi-indices of ``dim`` axes up to total ``degree``, graded.
 
@@ -37,7 +37,7 @@ def _of_degree(dim: int, degree: int) -> Iterator[MultiIndex]:
             yield (first, *rest)
 
 
-@lru_cache(maxsize=None)
+@cache
 def index_of(dim: int, degree: int) -> dict[MultiIndex, int]:
     """Position of every multi-index in ``multi_indices(dim, degree)``.
 
@@ -61,7 +61,7 @@ def count(dim: int, degree: int) -> int:
     return math.comb(degree + dim, dim) if degree >= 0 else 0
 
 
-@lru_cache(maxsize=None)
+@cache
 def degree_of_count(dim: int, terms: int) -> int:
     """The degree whose graded prefix has this many terms."""
     degree = 0
@@ -72,7 +72,7 @@ def degree_of_count(dim: int, terms: int) -> int:
     return degree
 
 
-@lru_cache(maxsize=None)
+@cache
 def degrees(dim: int, degree: int) -> np.ndarray:
     """|a| of every multi-index, (T,)."""
     return np.array([sum(a) for a in multi_indices(dim, degree)])
@@ -85,7 +85,7 @@ def _positions(places: list[int]) -> Any:
     return np.array(places)
 
 
-@lru_cache(maxsize=None)
+@cache
 def product_rows(dim: int, left: int, right: int, degree: int) -> tuple[tuple[int, Any], ...]:
     """For each index a of the left factor: how many terms of the right one count, and where.
 
@@ -100,28 +100,7 @@ def product_rows(dim: int, left: int, right: int, degree: int) -> tuple[tuple[in
     return tuple(rows)
 
 
-@lru_cache(maxsize=None)
-def product_pairs(dim: int, left: int, right: int, low: int, high: int) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs (I, J) of a product's output rows of degree low..high, each (rows, M).
-
-    Padded with the position one past the end, where the factors hold a row of zeros.
-    """
-    lefts, rights = index_of(dim, left), index_of(dim, right)
-    rows: list[list[tuple[int, int]]] = []
-    for c in multi_indices(dim, high)[count(dim, low - 1):]:
-        pairs = []
-        for a, i in lefts.items():
-            b = tuple(m - n for m, n in zip(c, a, strict=True))
-            if b in rights:
-                pairs.append((i, rights[b]))
-        rows.append(pairs)
-    width = max(1, *(len(r) for r in rows))
-    padding = (len(lefts), len(rights))
-    table = np.array([r + [padding] * (width - len(r)) for r in rows])
-    return table[..., 0], table[..., 1]
-
-
-@lru_cache(maxsize=None)
+@cache
 def block_rows(dim: int, left: int, right: int) -> tuple[Any, ...]:
     """For each index a of degree ``left``: places of a + b in degree left + right, all |b| = right."""
     place = {c: i for i, c in enumerate(_of_degree(dim, left + right))}

@@ -14,7 +14,8 @@ from jax.extend.core import Literal
 
 from jsmitsm import abstract
 from jsmitsm.abstract import EXTRAS, FIELD, JUMPS, POINT, Facts
-from jsmitsm.jets import EVERYTHING, NOTHING, evaluate, levels, plain
+from jsmitsm.jaxprs import EVERYTHING, NOTHING, levels
+from jsmitsm.jets import evaluate, plain
 from jsmitsm.linearize import Record, record
 from jsmitsm.operators import Slot, local_field
 from jsmitsm.program import fingerprint, kept
@@ -190,7 +191,7 @@ class Traced:
         static = {k: np.asarray(c) for k, c in enumerate(inputs.consts) if _is_structure(c)}
         key = (
             self._fingerprint, tuple((k, c.dtype.str, c.shape, c.tobytes()) for k, c in static.items()),
-            self.slots, self.pattern.tobytes(), degree, jac, res, bool(jax.config.jax_enable_x64),
+            self.slots, self.pattern.tobytes(), degree, jac, res,
         )  # fmt: skip
         moving = inputs._replace(consts=[None if k in static else c for k, c in enumerate(inputs.consts)])
 
@@ -232,8 +233,8 @@ class _Inputs:
 
         points = self.points if ("points", 0) in read else _zeros(self.points)
         slots = self.slots if any(name == "slots" for name, _ in read) else None
-        groups = (some(name, getattr(self, name)) for name in ("extras", "leaves", "consts"))
-        return _Inputs(points, *groups, slots)
+        extras, leaves, consts = (some(name, getattr(self, name)) for name in ("extras", "leaves", "consts"))
+        return _Inputs(points, extras, leaves, consts, slots)
 
     def chunk(self, low: int) -> _Inputs:
         cut = slice(low, low + CHUNK)

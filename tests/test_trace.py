@@ -42,7 +42,8 @@ TABLE = {
     "biharmonic": (lambda u, x: laplacian(laplacian(u))(x), ((4, 0), (2, 2), (0, 4)), 4, True, True, "zero"),
     "heat": (lambda u, x: partial(u, (0, 1))(x) - partial(u, (2, 0))(x), ((0, 1), (2, 0)), 2, True, True, "zero"),
     "field algebra": (
-        lambda u, x: (2 * laplacian(u) - laplacian(u) - partial(u, (0, 2)) + 0 * u)(x), ((2, 0),), 2, True, True, "zero",
+        lambda u, x: (2 * laplacian(u) - laplacian(u) - partial(u, (0, 2)) + 0 * u)(x),
+        ((2, 0),), 2, True, True, "zero",
     ),
     "div(a grad u)": (
         lambda u, x: divergence(lambda y: a(y) * grad(u)(y))(x), ((1, 0), (0, 1), *LAPLACE), 2, True, False, "zero",
@@ -56,7 +57,8 @@ TABLE = {
     "hessian": (lambda u, x: jnp.sum(hessian(u)(x) * jnp.eye(2)), LAPLACE, 2, True, True, "zero"),
     "zero literal": (lambda u, x: laplacian(u)(x) + 0.0 * jnp.sin(u(x)), LAPLACE, 2, True, True, "zero"),
     "Burgers": (
-        lambda u, x: u(x) * partial(u, (1, 0))(x) - partial(u, (0, 2))(x), ((0, 0), (1, 0), (0, 2)), 2, False, False, "zero",
+        lambda u, x: u(x) * partial(u, (1, 0))(x) - partial(u, (0, 2))(x),
+        ((0, 0), (1, 0), (0, 2)), 2, False, False, "zero",
     ),
     "Bratu": (lambda u, x: laplacian(u)(x) + jnp.exp(u(x)), ((0, 0), *LAPLACE), 2, False, False, "constant"),
     "minimal surface": (
@@ -79,7 +81,8 @@ TABLE = {
         ((0, 0), *LAPLACE), 2, True, False, "zero",
     ),
     "branch": (
-        lambda u, x: jax.lax.cond(x[0] > 0, lambda: laplacian(u)(x), lambda: u(x)), ((0, 0), *LAPLACE), 2, True, False, "zero",
+        lambda u, x: jax.lax.cond(x[0] > 0, lambda: laplacian(u)(x), lambda: u(x)),
+        ((0, 0), *LAPLACE), 2, True, False, "zero",
     ),
     "jit": (lambda u, x: jax.jit(lambda y: a(y) * u(y))(x), ((0, 0),), 0, True, False, "zero"),
     "remat": (lambda u, x: jax.checkpoint(lambda y: jnp.sin(y[0]) * u(y))(x), ((0, 0),), 0, True, False, "zero"),
@@ -164,7 +167,8 @@ def test_nonlinear_linearisation():
     u, ux = series(lambda x: jnp.sin(x[0]) * x[1]), series(lambda x: jnp.cos(x[0]) * x[1])
     slots = np.stack([{(0, 0): u, (1, 0): ux, (0, 2): 0 * u}[index] for _, index in got.slots])
     jac, res = got.coefficients(points, 3, slots=slots)
-    assert np.allclose(jac[0, got.slots.index((0, (0, 0)))], ux) and np.allclose(jac[0, got.slots.index((0, (1, 0)))], u)
+    assert np.allclose(jac[0, got.slots.index((0, (0, 0)))], ux)
+    assert np.allclose(jac[0, got.slots.index((0, (1, 0)))], u)
     assert np.allclose(jac[0, got.slots.index((0, (0, 2)))], [[-1.0] * 4] + [[0.0] * 4] * 9)
     assert np.allclose(res[0], series(lambda x: jnp.sin(x[0]) * jnp.cos(x[0]) * x[1] ** 2), atol=1e-15)
     compiled = jax.jit(lambda p, s: got.coefficients(p, 3, slots=s))(points, slots)
@@ -273,7 +277,10 @@ def test_gradients_match_differences():
     slots = np.random.default_rng(2).normal(size=(2, count(2, 2), 3))
 
     def total(k, params, points, slots):
-        got = trace(lambda u, x, p: a(k * x) * laplacian(u)(x) * u(x) + p["q"] * u(x) ** 3 - jnp.sqrt(x[0]), 2, params=params)
+        def pde(u, x, p):
+            return a(k * x) * laplacian(u)(x) * u(x) + p["q"] * u(x) ** 3 - jnp.sqrt(x[0])
+
+        got = trace(pde, 2, params=params)
         full = jnp.concatenate([slots, slots[:1]])
         return weighted(got.coefficients(points, 2, params=params, slots=full))
 

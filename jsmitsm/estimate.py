@@ -1,0 +1,174 @@
+"""Error estimate by defect correction, and reuse of what a new right-hand side leaves valid."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jsmitsm import discretize as dz
+from jsmitsm.boundary import is_traced
+from jsmitsm.clouds import Cloud
+from jsmitsm.discretize import Discretization, Numbers
+from jsmitsm.kernels import Kernel
+from jsmitsm.neighbours import Stencils
+from jsmitsm.problem import Problem
+from jsmitsm.solution import Recipe, Solution
+from jsmitsm.solve import Fit, discretized
+from jsmitsm.system import Run
+from jsmitsm.taylor import multi_indices
+
+
+def error_estimate(solution: Solution) -> Any:
+    """Estimated error |u - u_exact| of every particle, (N,) or (N, F).
+
+    The defect of the solution in rows of order p + 2, taken through the inverse of its own
+    matrix: e = A_p^-1 D (b_{p+2} - A_{p+2} u_p). D brings the rows of the two orders to one scale,
+    that of the source in them. Held values have no error; where p + 2 is no better than p (no
+    smoothness, or round-off) the estimate says little.
+    """
+    fit: Fit = solution._fit
+    if fit is None:
+        raise ValueError("error_estimate: this solution was pickled without its problem; ask before pickling")
+    low = fit.discretization()
+    run = Run(low, fit.problem, "auto", True, False, "loo")
+    nums = dz.numbers(low, fit.problem, fit.taylor)
+    classes, rows = dz.all_rows(low, nums)
+    high, high_nums = _higher(fit, low)
+    defect = _per_value(high, *dz.all_rows(high, high_nums), high_nums, solution._values)
+    own = _per_value(low, classes, rows, nums, solution._values)
+    free = np.flatnonzero(~low.held.reshape(-1))
+    ratio = own[1].reshape(-1)[free] / defect[1].reshape(-1)[free]
+    xp = jnp if is_traced(ratio) else np
+    ratio = xp.where(xp.isfinite(ratio) & (ratio != 0), ratio, 1.0)
+    data, r, c = dz.matrix(low, classes, rows)
+    x, _ = run.solved(data, r, c, ratio * defect[0].reshape(-1)[free])
+    zero = xp.zeros(low.held.size)
+    error = zero.at[free].set(x) if xp is jnp else _put(zero, free, x)
+    error = xp.abs(error).reshape(low.held.shape)
+    return error[:, 0] if low.rec.fields == 1 else error
+
+
+def _put(array: np.ndarray, at: np.ndarray, value: Any) -> np.ndarray:
+    array[at] = value
+    return array
+
+
+def _higher(fit: Fit, low: Discretization) -> tuple[Discretization, Numbers]:
+    """The same problem with method S of order p + 2 on its own stencils."""
+    order = fit.recipe.order + 2
+    host = jax.lax.stop_gradient(fit.cloud.points)
+    if is_traced(host):
+        raise ValueError(
+            "error_estimate: the points are traced by a JAX transform, and the wider stencils it needs are found on "
+            "the host; ask for it outside the transform"
+        )
+    high = discretized(fit.problem, Cloud(np.asarray(host), low.cloud.groups, low.cloud.normals), "S", order)
+    high.cloud = fit.cloud
+    taylor = fit.taylor
+    if taylor is not None:
+        more = len(multi_indices(low.rec.dim, order)) - taylor.shape[2]
+        taylor = (jnp if is_traced(taylor) else np).pad(taylor, ((0, 0), (0, 0), (0, more)))
+    return high, dz.numbers(high, fit.problem, taylor)
+
+
+def _per_value(disc: Discretization, classes: Any, rows: Any, nums: Numbers, values: Any) -> tuple[Any, Any]:
+    """The residual b - A u of every row, and the weight of the source in it, both (N, F)."""
+    traced = is_traced(rows, values)
+    xp = jnp if traced else np
+    b = dz.right_side(disc, nums, classes, rows)
+    data, r, c = dz.matrix(disc, classes, rows)
+    free = np.flatnonzero(~disc.held.reshape(-1))
+    u = xp.asarray(values).reshape(-1)[free]
+    au = xp.zeros(len(free)).at[r].add(data * u[c]) if traced else np.bincount(r, data * u[c], len(free))
+    residual, weight = xp.zeros(disc.held.size), xp.ones(disc.held.size)
+    first = np.array(disc.rec.equation_rows)
+    parts = [xp.abs(xp.asarray(row.source)[:, :, first]).max(axis=2) for row in rows]
+    ids = np.concatenate([cls.ids for cls in classes])
+    strength = xp.concatenate(parts)
+    if traced:
+        residual = residual.at[free].set(b - au)
+        return residual.reshape(disc.held.shape), weight.reshape(disc.held.shape).at[ids].set(strength)
+    residual[free] = b - au
+    weight = weight.reshape(disc.held.shape)
+    weight[ids] = strength
+    return residual.reshape(disc.held.shape), weight
+
+
+class Factorization:
+    """A problem ready to be solved again; made by :func:`factorize`.
+
+    ``solve(problem)`` keeps the neighbours, the rows and the factors as long as only the source and
+    the values in the conditions changed, and makes anew what else did.
+    """
+
+    def __init__(self, disc: Discretization, problem: Problem, solver: str):
+        self._disc, self._problem, self._solver = disc, problem, solver
+        self._run = Run(disc, problem, solver, True, disc.kernel is None, "loo")
+        self._nums = dz.numbers(disc, problem)
+        self._classes, self._rows = self._run.local_rows(self._nums)
+        self._matrix = dz.matrix(disc, self._classes, self._rows)
+
+    def solve(self, problem: Problem) -> Solution:
+        """The solution of a problem with the same operator: (source and boundary values may differ)."""
+        old = self._disc
+        disc = discretized(
+            problem, old.cloud, old.scheme.method, old.rec.order, old.kernel, Stencils(dz.table(old), None)
+        )
+        if disc.scheme != old.scheme or not np.array_equal(disc.held, old.held):
+            raise ValueError(
+                "problem: its operator or the kind of its conditions differs from the one that was factorised; "
+                "call js.factorize again"
+            )
+        nums = dz.numbers(disc, problem)
+        same = _same(nums.jac, self._nums.jac) and _same(nums.own, self._nums.own) and _same(nums.data, self._nums.data)
+        if not same or disc.scheme.method in ("I", "II"):
+            return Factorization(disc, problem, self._solver)._finish(problem, None)
+        return self._finish(problem, nums)
+
+    def _finish(self, problem: Problem, nums: Numbers | None) -> Solution:
+        nums = self._nums if nums is None else nums
+        disc = self._disc
+        x, good = self._run.solved(*self._matrix, dz.right_side(disc, nums, self._classes, self._rows))
+        values = dz.with_held(disc, nums, x)
+        recipe = Recipe(disc.scheme.method, disc.rec.order, None, "loo", problem.fields)
+        fit = Fit(problem, disc.cloud, disc.kernel, dz.table(disc), None, recipe)
+        return Solution(values, disc.cloud, recipe, fit, good, 1, self._run.stats())
+
+    def __repr__(self) -> str:
+        return f"Factorization({int((~self._disc.held).sum())} unknowns, method={self._disc.scheme.method!r})"
+
+
+def _same(x: Any, y: Any) -> bool:
+    return np.shape(x) == np.shape(y) and bool(np.array_equal(np.asarray(x), np.asarray(y)))
+
+
+def factorize(
+    problem: Problem, cloud: Cloud, *, method: str = "S", order: int = 4, kernel: Kernel | None = None,
+    stencils: Stencils | None = None, solver: str = "auto",
+) -> Factorization:  # fmt: skip
+    """Prepare a linear problem for many right-hand sides.
+
+    Returns an object whose ``solve(problem)`` reuses everything that a change of the source or of
+    the values in the conditions leaves valid: neighbours, moment systems, ordering and factors.
+
+    Raises ValueError for a nonlinear problem: its matrix changes in every step.
+
+    Examples
+    --------
+    >>> import jax; jax.config.update("jax_enable_x64", True)
+    >>> import jsmitsm as js
+    >>> cloud = js.interval(0.0, 1.0, 11)
+    >>> def heated(q):
+    ...     ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(0.0)}
+    ...     return js.Problem(lambda u, x: js.laplacian(u)(x) + q, ends)
+    >>> ready = js.factorize(heated(1.0), cloud)
+    >>> round(float(ready.solve(heated(8.0)).u[5]), 10)
+    1.0
+    """
+    disc = discretized(problem, cloud, method, order, kernel, stencils)
+    if not disc.linear:
+        raise ValueError("problem: it is nonlinear, so its matrix changes in every step; use js.solve")
+    return Factorization(disc, problem, solver)

@@ -1,0 +1,136 @@
+"""Meshes as seen by a cloud: the cells of the domain, its boundary facets, their normals and names."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+# The facets of each kind of cell, by the cell's nodes: corners first, nodes of second order after them.
+_FACETS: dict[str, list[tuple[int, ...]]] = {
+    "line": [(0,), (1,)],
+    "line3": [(0,), (1,)],
+    "triangle": [(0, 1), (1, 2), (2, 0)],
+    "triangle6": [(0, 1, 3), (1, 2, 4), (2, 0, 5)],
+    "quad": [(0, 1), (1, 2), (2, 3), (3, 0)],
+    "quad8": [(0, 1, 4), (1, 2, 5), (2, 3, 6), (3, 0, 7)],
+    "quad9": [(0, 1, 4), (1, 2, 5), (2, 3, 6), (3, 0, 7)],
+    "tetra": [(1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1)],
+    "tetra10": [(1, 2, 3, 5, 9, 8), (0, 3, 2, 7, 9, 6), (0, 1, 3, 4, 8, 7), (0, 2, 1, 6, 5, 4)],
+    "hexahedron": [(0, 3, 2, 1), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7)],
+    "wedge": [(0, 2, 1), (3, 4, 5), (0, 1, 4, 3), (1, 2, 5, 4), (2, 0, 3, 5)],
+    "pyramid": [(0, 3, 2, 1), (0, 1, 4), (1, 2, 4), (2, 3, 4), (3, 0, 4)],
+}  # fmt: skip
+_DIMS = {"vertex": 0} | {
+    kind: 1 if kind.startswith("line") else 2 if kind.startswith(("tri", "quad")) else 3 for kind in _FACETS
+}
+_TAGS = ("gmsh:physical", "medit:ref", "cell_tags", "gambit:ref", "su2:tag", "avsucd:material")
+
+
+def volume_cells(blocks: Any) -> tuple[int, list[tuple[str, np.ndarray]]]:
+    """The dimension of a mesh and its cells of that dimension."""
+    blocks = [(block.type, np.asarray(block.data)) for block in blocks if len(block.data)]
+    unknown = sorted({kind for kind, _ in blocks} - set(_DIMS))
+    if unknown:
+        raise ValueError(
+            f"mesh: cells of kind {unknown[0]!r} are not understood; save it with one of {', '.join(_FACETS)}"
+        )
+    dim = max((_DIMS[kind] for kind, _ in blocks), default=0)
+    if dim == 0:
+        raise ValueError("mesh: has no cells (lines, triangles, tetrahedra, ...); for bare points use js.Cloud")
+    return dim, [(kind, block) for kind, block in blocks if _DIMS[kind] == dim]
+
+
+def boundary_normals(points: np.ndarray, cells: list[tuple[str, np.ndarray]]) -> np.ndarray:
+    """Unit outward normals (N, D) of the nodes on facets that belong to one cell only, NaN elsewhere."""
+    dim = points.shape[1]
+    facets, centres = [], []
+    for kind, block in cells:
+        corners = block[:, : _corners(_FACETS[kind])]
+        for facet in _FACETS[kind]:
+            facets += [block[:, list(facet)]]
+            centres += [points[corners].mean(axis=1)]
+    heads = [_padded(np.sort(f[:, : _head(f.shape[1], dim)], axis=1)) for f in facets]
+    _, first, count = np.unique(np.concatenate(heads), axis=0, return_index=True, return_counts=True)
+    outer = np.zeros(sum(map(len, heads)), bool)
+    outer[first[count == 1]] = True
+    total = np.zeros(points.shape)
+    for facet, centre, mask in zip(facets, centres, np.split(outer, np.cumsum([len(h) for h in heads])[:-1])):
+        _add_normals(total, points, facet[mask], centre[mask])
+    length = np.linalg.norm(total, axis=1, keepdims=True)
+    return np.where(length > 0, total / np.where(length > 0, length, 1.0), np.nan)
+
+
+def _add_normals(total: np.ndarray, points: np.ndarray, facets: np.ndarray, centres: np.ndarray) -> None:
+    """Add every facet's unit normal at its nodes, weighted by the facet's angle there."""
+    dim = points.shape[1]
+    head = facets[:, : _head(facets.shape[1], dim)]
+    at = points[head]
+    if dim == 1:
+        normal = np.ones((len(facets), 1))
+    elif dim == 2:
+        side = at[:, 1] - at[:, 0]
+        normal = np.stack([side[:, 1], -side[:, 0]], axis=1)
+    else:
+        # The diagonals of a quadrilateral, two sides of a triangle.
+        normal = np.cross(at[:, 2] - at[:, 0], at[:, -1] - at[:, 1])
+    normal = normal * np.sign(np.sum(normal * (at.mean(axis=1) - centres), axis=1, keepdims=True))
+    normal = normal / np.linalg.norm(normal, axis=1, keepdims=True)
+    for k in range(facets.shape[1]):
+        angle = np.ones(len(facets))
+        if dim == 3 and k < head.shape[1]:
+            one, two = (at[:, (k + s) % head.shape[1]] - at[:, k] for s in (1, -1))
+            cosine = np.sum(one * two, axis=1) / (np.linalg.norm(one, axis=1) * np.linalg.norm(two, axis=1))
+            angle = np.arccos(np.clip(cosine, -1, 1))
+        np.add.at(total, facets[:, k], normal * angle[:, None])
+
+
+def _corners(facets: list[tuple[int, ...]]) -> int:
+    """How many corners a cell has: its nodes of second order come after them."""
+    second = {6: 3, 3: 2}
+    dim_heads = [f[: second.get(len(f), len(f))] if _is_second_order(facets) else f for f in facets]
+    return len(set().union(*dim_heads))
+
+
+def _is_second_order(facets: list[tuple[int, ...]]) -> bool:
+    return facets in (_FACETS["triangle6"], _FACETS["quad8"], _FACETS["tetra10"])
+
+
+def _head(nodes: int, dim: int) -> int:
+    """Corners among the nodes of a facet."""
+    return {1: 1, 2: 2, 3: 3 if nodes == 6 else nodes}[dim] if nodes > 1 else 1
+
+
+def _padded(rows: np.ndarray) -> np.ndarray:
+    """Rows of four, so that triangles and quadrilaterals compare."""
+    return np.concatenate([rows, np.full((len(rows), 4 - rows.shape[1]), -1)], axis=1)
+
+
+def named_facets(mesh: Any, dim: int, tags: str | None) -> dict[str, np.ndarray]:
+    """Nodes by the name of the facets or point sets they belong to, in the order of the names in the file."""
+    named: dict[str, list[np.ndarray]] = {}
+    facets = [k for k, block in enumerate(mesh.cells) if _DIMS.get(block.type) == dim - 1]
+    keys = [tags] if tags is not None else [key for key in _TAGS if key in mesh.cell_data]
+    if tags is not None and tags not in mesh.cell_data:
+        raise ValueError(f"tags: {tags!r} is none of the mesh's cell data {sorted(mesh.cell_data)}")
+    for key in keys[:1]:
+        names = {int(entry[0]): name for name, entry in mesh.field_data.items() if int(entry[1]) == dim - 1}
+        numbers = {k: np.asarray(mesh.cell_data[key][k]).astype(int).ravel() for k in facets}
+        present = sorted(set().union(*map(set, numbers.values())) if numbers else (), key=_order_of(names))
+        for number in present:
+            nodes = [mesh.cells[k].data[numbers[k] == number].ravel() for k in facets]
+            named.setdefault(names.get(int(number), str(number)), []).extend(nodes)
+    for name, members in ({} if keys else mesh.cell_sets).items():
+        # Gmsh's bounding entities and the like are no groups of the user's.
+        if not name.startswith("gmsh:"):
+            nodes = [mesh.cells[k].data[np.asarray(members[k], int)].ravel() for k in facets if members[k] is not None]
+            named.setdefault(name, []).extend(nodes)
+    for name, members in mesh.point_sets.items():
+        named.setdefault(name, []).append(np.asarray(members, int).ravel())
+    return {name: np.concatenate(nodes) for name, nodes in named.items() if nodes}
+
+
+def _order_of(names: dict[int, str]) -> Any:
+    """Named tags in the order of their names in the file, then the others by number."""
+    place = {number: k for k, number in enumerate(names)}
+    return lambda number: (place.get(int(number), len(place)), int(number))

@@ -1,0 +1,106 @@
+"""Factorisations kept for the next solve with the same matrix.
+
+They are found again by the values of the matrix, compared exactly, so that the adjoint of a solve,
+its tangent and a second right-hand side need not know of one another.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import jax
+import numpy as np
+
+from jsmitsm.sparse import COUNTS, Factor
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What a factorisation depends on besides the entries; hashable, a primitive's parameter."""
+
+    n: int
+    points: np.ndarray | None = field(repr=False)
+    solver: str
+    elliptic: bool
+    refine: int
+
+    def __hash__(self) -> int:
+        return hash((self.n, self.solver, self.elliptic, self.refine))
+
+    def __eq__(self, other: object) -> bool:
+        return (
+            isinstance(other, Settings)
+            and hash(self) == hash(other)
+            and (self.n, self.solver) == (other.n, other.solver)
+            and (self.elliptic, self.refine) == (other.elliptic, other.refine)
+            and _same(self.points, other.points)
+        )
+
+
+def _same(a: Any, b: Any) -> bool:
+    """Whether two arrays hold the same values (NaN equals NaN)."""
+    if a is b:
+        return True
+    if a is None or b is None or a.shape != b.shape:
+        return False
+    # Two views of one JAX array, which the cache keeps alive and nobody can change.
+    if (a.ctypes.data, a.strides, a.dtype) == (b.ctypes.data, b.strides, b.dtype):
+        return True
+    step = max(1, len(a) // 32)  # a glance first: most arrays that differ, differ there
+    nan = a.dtype.kind == "f"
+    return np.array_equal(a[::step], b[::step], nan) and np.array_equal(a, b, nan)
+
+
+@dataclass(eq=False)
+class _Entry:
+    """A kept factorisation and the arrays it was made of."""
+
+    arrays: list[np.ndarray]
+    settings: Settings
+    factor: Factor
+
+    def same_pattern(self, arrays: list[np.ndarray], settings: Settings) -> bool:
+        return settings == self.settings and all(map(_same, arrays[1:], self.arrays[1:]))
+
+
+_cache: list[_Entry] = []  # the last one used stands last
+_lock = threading.Lock()
+CACHE_ENTRIES, CACHE_BYTES = 64, 2**30
+
+
+def clear_cache() -> None:
+    """Forget every kept factorisation and so free its memory."""
+    with _lock:
+        _cache.clear()
+
+
+def factorisations() -> int:
+    """Number of factorisations made so far in this process."""
+    return COUNTS["factorisations"]
+
+
+def lookup(arrays: Sequence[Any], settings: Settings) -> tuple[Factor, bool]:
+    """The factorisation of (data, rows, cols), and whether it was kept."""
+    views = [np.asarray(a) for a in arrays]
+    order = None
+    with _lock:
+        for entry in reversed(_cache):
+            if entry.same_pattern(views, settings):
+                if _same(views[0], entry.arrays[0]):
+                    _cache.remove(entry)
+                    _cache.append(entry)
+                    return entry.factor, True
+                order = entry.factor.order
+    s, (data, rows, cols) = settings, views
+    made = Factor(data, rows, cols, s.n, s.points, s.solver, s.elliptic, s.refine, order)
+    # A JAX array cannot change; any other may be changed in place after this call.
+    kept = [v if isinstance(a, jax.Array) else np.array(v) for a, v in zip(arrays, views)]
+    with _lock:
+        _cache.append(_Entry(kept, settings, made))
+        total = sum(entry.factor.nbytes for entry in _cache)
+        while len(_cache) > 1 and (len(_cache) > CACHE_ENTRIES or total > CACHE_BYTES):
+            total -= _cache.pop(0).factor.nbytes
+    return made, False

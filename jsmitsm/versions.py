@@ -1,0 +1,38 @@
+"""What is installed here, for a report of a fault."""
+
+from __future__ import annotations
+
+import os
+import platform
+import sys
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any
+
+_NEEDED = ("jax", "jaxlib", "numpy", "scipy", "optax")
+_EXTRAS = ("matplotlib", "meshio", "shapely", "pandas", "xarray", "pyamg", "tqdm")
+
+
+def show_versions(file: Any = None) -> None:
+    """Print the versions of jsmitsm, Python and the libraries, the devices and the precision.
+
+    Paste it into a report of a fault. ``file``: where to print, standard output if not given.
+
+    >>> import jsmitsm as js
+    >>> js.show_versions()  # doctest: +ELLIPSIS
+    jsmitsm      ...
+    """
+    import jax
+
+    lines = [("jsmitsm", _version("jsmitsm")), ("python", sys.version.split()[0]), ("system", platform.platform())]
+    lines += [("cores", str(os.cpu_count()))]
+    lines += [(name, _version(name)) for name in _NEEDED + _EXTRAS]
+    lines += [("devices", ", ".join(map(str, jax.devices())))]
+    lines += [("float64", "on" if jax.config.jax_enable_x64 else "off (jax_enable_x64)")]
+    print("\n".join(f"{name:12} {value}" for name, value in lines), file=file)
+
+
+def _version(name: str) -> str:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return "from its sources" if name == "jsmitsm" else "not installed"

@@ -1,0 +1,200 @@
+"""Derivatives of a solve with respect to everything it was given, against central differences.
+
+Truncation of a central difference with step 1e-5 is about 1e-10 relative and its rounding
+1e-16 / 1e-5 times a condition number below 1e3, so an exact gradient agrees to well below 1e-6.
+Everything is smooth there: no particle sits near the edge of a support (asserted), and the
+neighbour sets are held.
+"""
+
+import jax
+import jax.numpy as jnp
+import manufactured as mm
+import numpy as np
+import pytest
+
+import jsmitsm as js
+
+STEP = 1e-5
+BOUND = 1e-6
+NAMES = ("h", "d", "wall", "source", "diffusion", "reaction", "flux", "robin_a", "robin_b", "robin_value", "points")
+
+
+class Case:
+    """A problem of variable coefficients on one cloud, every number of it in one dict."""
+
+    def __init__(self, dim, n, order, reach):
+        self.dim, self.order = dim, order
+        self.cloud = mm.jittered(dim, n, jitter=0.2)
+        self.stencils = js.stencils(self.cloud, radius=1.05 * reach / (n - 1))
+        groups = self.cloud.groups
+        x = self.cloud.points
+        wall = "bottom" if dim > 1 else "right"
+        self.weights = np.cos(3.0 * x.sum(axis=1)) + 0.5
+        self.theta = {
+            "h": reach / 3.0 / (n - 1), "d": 3.0, "wall": np.sin(1.0 + x[groups[wall]].sum(axis=1)),
+            "source": 2.0, "diffusion": 0.4, "reaction": 1.5, "flux": 0.7,
+            "robin_a": 2.0, "robin_b": 0.5, "robin_value": 0.3, "points": x,
+        }  # fmt: skip
+
+    def problem(self, t):
+        def pde(u, x, p):
+            a = lambda y: 1.0 + p["diffusion"] * jnp.sin(y[0])
+            flux = lambda y: a(y) * js.grad(u)(y)
+            return js.divergence(flux)(x) - p["reaction"] * u(x) - p["source"] * jnp.exp(x[0]) * jnp.cos(x[-1])
+
+        robin = js.robin(t["robin_a"], t["robin_b"], t["robin_value"])
+        if self.dim == 1:
+            bcs = {"left": robin, "right": js.dirichlet(t["wall"])}
+        else:
+            slope = js.neumann(lambda x, p: p["flux"] * jnp.cos(x[1]))
+            bcs = {"left": slope, "right": robin, "bottom": js.dirichlet(t["wall"]), "top": js.dirichlet(0.5)}
+        return js.Problem(pde, bcs, params={k: t[k] for k in ("source", "diffusion", "reaction", "flux")})
+
+    def u(self, t, method, solver):
+        return js.solve(
+            self.problem(t), self.cloud.replace(points=t["points"]), method=method, order=self.order,
+            kernel=js.SuperGaussian(h=t["h"], d=t["d"]), stencils=self.stencils, solver=solver,
+        ).u  # fmt: skip
+
+    def objective(self, t, method="S", solver="dense"):
+        return jnp.sum(self.weights * self.u(t, method, solver) ** 2)
+
+    def direction(self, name):
+        """A tangent that moves one entry of the dict only."""
+        rng = np.random.default_rng(7)
+        moved = rng.uniform(-1, 1, np.shape(self.theta[name]))
+        return {k: moved if k == name else np.zeros(np.shape(v)) for k, v in self.theta.items()}
+
+
+@pytest.fixture(scope="module")
+def line():
+    return Case(1, 10, 4, 4.4)
+
+
+@pytest.fixture(scope="module")
+def plane():
+    return Case(2, 6, 3, 3.3)
+
+
+def along(tree, direction):
+    return float(sum(np.sum(np.asarray(a) * b) for a, b in zip(jax.tree.leaves(tree), jax.tree.leaves(direction))))
+
+
+def difference(function, t, direction):
+    ahead, back = (jax.tree.map(lambda x, v: x + s * STEP * v, t, direction) for s in (1.0, -1.0))
+    return (float(function(ahead)) - float(function(back))) / (2 * STEP)
+
+
+def test_no_particle_sits_near_the_edge_of_a_support(line, plane):
+    """Otherwise a difference would compare two neighbour sets, and prove nothing."""
+    for case in (line, plane):
+        x = case.cloud.points
+        apart = np.linalg.norm(x[:, None] - x[None], axis=2)
+        assert np.abs(apart - case.theta["h"] * case.theta["d"]).min() > 20 * STEP
+
+
+@pytest.mark.parametrize("solver", ["dense", "sparse"])
+@pytest.mark.parametrize("method", mm.METHODS)
+def test_every_derivative_in_2d(plane, method, solver):
+    f = lambda t: plane.objective(t, method, solver)
+    gradient = jax.grad(f)(plane.theta)
+    assert set(gradient) == set(NAMES)
+    assert all(np.isfinite(g).all() for g in jax.tree.leaves(gradient))
+    for name in NAMES:
+        direction = plane.direction(name)
+        exact, measured = along(gradient, direction), difference(f, plane.theta, direction)
+        assert abs(exact - measured) <= BOUND * max(abs(measured), 1e-2), name
+        assert abs(measured) > 1e-6, f"{name} does not move the objective: nothing was tested"
+
+
+def test_dense_and_sparse_gradients_agree(plane):
+    """The same adjoint by two factorisations: round-off times a condition number below 1e3."""
+    dense, sparse = (jax.grad(lambda t, s=s: plane.objective(t, "S", s))(plane.theta) for s in ("dense", "sparse"))
+    for name in NAMES:
+        scale = np.abs(dense[name]).max()
+        assert np.abs(np.asarray(dense[name]) - np.asarray(sparse[name])).max() < 1e-10 * scale, name
+
+
+@pytest.mark.parametrize("name", ["h", "points", "wall", "diffusion"])
+def test_forward_mode_agrees_with_reverse_mode(line, name):
+    def f(value):
+        return line.objective({**line.theta, name: value})
+
+    reverse, forward = jax.grad(f)(line.theta[name]), jax.jacfwd(f)(line.theta[name])
+    assert np.allclose(forward, reverse, rtol=1e-9, atol=1e-9 * np.abs(reverse).max())
+
+
+def test_one_smoothing_length_per_particle(line):
+    """The gradient with respect to h_i, one difference for each particle; their sum is dJ/dh."""
+    n = len(line.cloud)
+    f = lambda h: line.objective({**line.theta, "h": h})
+    each = np.asarray(jax.grad(f)(jnp.full(n, line.theta["h"])))
+    alone = float(jax.grad(f)(line.theta["h"]))
+    assert each.sum() == pytest.approx(alone, rel=1e-9)
+    for i in (1, n // 2, 0):
+        step = np.zeros(n)
+        step[i] = STEP
+        h = np.full(n, line.theta["h"])
+        measured = (float(f(h + step)) - float(f(h - step))) / (2 * STEP)
+        assert each[i] == pytest.approx(measured, rel=BOUND, abs=BOUND * abs(alone))
+
+
+@pytest.mark.parametrize("solver", ["dense", "auto"])
+def test_jit_returns_the_same(line, solver):
+    f = lambda t: line.u(t, "S", solver)
+    assert np.allclose(jax.jit(f)(line.theta), f(line.theta), rtol=0, atol=1e-11)
+
+
+def test_jit_of_grad_returns_the_same(line):
+    plain, compiled = jax.grad(line.objective)(line.theta), jax.jit(jax.grad(line.objective))(line.theta)
+    for name in NAMES:
+        assert np.allclose(compiled[name], plain[name], rtol=1e-8, atol=1e-8), name
+
+
+def test_vmap_over_numbers_returns_the_same(line):
+    """A batch of source strengths and boundary values against one solve after the other."""
+    strength, wall = np.array([0.5, 1.0, 2.0]), np.array([[0.1], [0.2], [-0.3]])
+    f = lambda s, w: line.u({**line.theta, "source": s, "wall": w}, "S", "dense")
+    batch = jax.vmap(f)(strength, wall)
+    assert batch.shape == (3, len(line.cloud))
+    for k in range(3):
+        assert np.allclose(batch[k], f(strength[k], wall[k]), rtol=0, atol=1e-11)
+
+
+def test_vmap_over_smoothing_lengths_returns_the_same(line):
+    h = line.theta["h"] * np.array([0.95, 1.0])
+    f = lambda h: line.u({**line.theta, "h": h}, "S", "dense")
+    batch = jax.vmap(f)(h)
+    for k in range(2):
+        assert np.allclose(batch[k], f(h[k]), rtol=0, atol=1e-11)
+    assert np.abs(batch[0] - batch[1]).max() > 1e-9, "h does not matter: nothing was tested"
+
+
+def test_values_that_the_pde_closes_over(line):
+    """A traced number that reaches the residual by closure, not through ``params``."""
+
+    def f(k):
+        problem = js.Problem(
+            lambda u, x: js.laplacian(u)(x) - k * jnp.sin(x[0]) * u(x) - k**2,
+            {"left": js.dirichlet(k), "right": js.neumann(lambda x: k * x[0])},
+        )
+        sol = js.solve(problem, line.cloud, order=4, stencils=line.stencils,
+                       kernel=js.SuperGaussian(line.theta["h"], 3.0), solver="dense")  # fmt: skip
+        return jnp.sum(line.weights * sol.u**2)
+
+    measured = (float(f(1.3 + STEP)) - float(f(1.3 - STEP))) / (2 * STEP)
+    assert float(jax.grad(f)(1.3)) == pytest.approx(measured, rel=BOUND)
+
+
+def test_gradient_through_evaluation_between_particles(line):
+    """d/dk of sol(points) and of sol.grad(points): the local polynomials carry derivatives too."""
+    points = np.array([[0.21], [0.68]])
+
+    def f(s):
+        t = {**line.theta, "source": s}
+        sol = js.solve(line.problem(t), line.cloud, order=4, stencils=line.stencils,
+                       kernel=js.SuperGaussian(t["h"], t["d"]), solver="dense")  # fmt: skip
+        return jnp.sum(sol(points)) + 0.1 * jnp.sum(sol.grad(points))
+
+    measured = (float(f(2.0 + STEP)) - float(f(2.0 - STEP))) / (2 * STEP)
+    assert float(jax.grad(f)(2.0)) == pytest.approx(measured, rel=BOUND)
