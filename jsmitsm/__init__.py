@@ -7,6 +7,7 @@ from jsmitsm.kernels import Constant, CubicSpline, Gaussian, Kernel, SuperGaussi
 from jsmitsm.neighbours import Stencils, stencils
 from jsmitsm.operators import divergence, grad, hessian, laplacian, partial
 from jsmitsm.problem import Problem, condition, dirichlet, fix, free, neumann, periodic, robin
+from jsmitsm.shapes import from_polygon, from_sdf
 from jsmitsm.solution import Solution
 from jsmitsm.solve import solve
 from jsmitsm.taylor import multi_indices

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -78,6 +79,9 @@ def group_conditions(problem: Problem, cloud: Cloud, order: int, highest: int) -
     names = [name for name in cloud.groups if name != INTERIOR]
     given = dict(problem.bcs)
     used = {name for cs in given.values() for c in cs if c.kind == "periodic" for name in c.groups}
+    unknown = sorted(used - set(names))
+    if unknown:
+        raise ValueError(f"bcs: periodic names {unknown[0]!r}, which is no boundary group of the cloud; it has {names}")
     missing = [n for n in names if n not in given and n not in used and len(cloud.groups[n])]
     if missing:
         raise ValueError(
@@ -95,7 +99,23 @@ def group_conditions(problem: Problem, cloud: Cloud, order: int, highest: int) -
         rest = [c for c in conditions if c.kind not in ("fix", "periodic", "free")]
         if rest:
             groups.append(_laid_out(problem, cloud, name, cloud.groups[name], rest, order, highest))
-    return [g for g in groups if len(g.ids)]
+    groups = [g for g in groups if len(g.ids)]
+    _refuse_held_twice(groups, problem.fields, len(cloud))
+    return groups
+
+
+def _refuse_held_twice(groups: list[Group], fields: int, n: int) -> None:
+    """A value held by two conditions (a group's and a fixed particle's)."""
+    owner = np.full((n, fields), "", object)
+    for group in groups:
+        for k in group.held:
+            twice = group.ids[owner[group.ids, k] != ""]
+            if len(twice):
+                raise ValueError(
+                    f"bcs[{group.name!r}]: the value of particle {int(twice[0])} is held by "
+                    f"bcs[{owner[twice[0], k]!r}] already; remove it from one of the two"
+                )
+            owner[group.ids, k] = group.name
 
 
 def _laid_out(problem, cloud, name, ids, conditions: list[Condition], order: int, highest: int) -> Group:
@@ -174,9 +194,11 @@ def _component(problem: Problem, points: Any, value: Any, named: int | None, k: 
 
 def sample(function: Callable[..., Any], points: Any, params: Any, components: int, where: str) -> Any:
     """A user's function of x at all points: (components, n)."""
-    traced = trace(
-        lambda u, x, *p: _shaped(function(x, *p), components, where), points.shape[1], components, params=params
-    )
+    arguments = "x" if params is None else "x, params"
+    with _named(where, f"a function of {arguments} that returns a scalar"):
+        traced = trace(
+            lambda u, x, *p: _shaped(function(x, *p), components, where), points.shape[1], components, params=params
+        )
     _, values = traced.coefficients(points, 0, params=params)
     n = points.shape[0]
     if values is None:
@@ -186,6 +208,17 @@ def sample(function: Callable[..., Any], points: Any, params: Any, components: i
         bad = int(np.flatnonzero(~np.isfinite(np.asarray(values)).all(axis=0))[0])
         raise ValueError(f"{where}: the function returns NaN or infinity, first at x = {np.asarray(points)[bad]}")
     return values
+
+
+@contextmanager
+def _named(where: str, expected: str) -> Iterator[None]:
+    """Say which of the user's functions failed, and what was expected of it."""
+    try:
+        yield
+    except (TypeError, ValueError) as error:
+        if str(error).startswith(where):
+            raise
+        raise ValueError(f"{where}: expected {expected}; calling it failed: {error}") from error
 
 
 def _shaped(result: Any, components: int, where: str) -> Any:
@@ -230,7 +263,9 @@ def _parts(problem: Problem, points: Any, normals: Any, c: Condition, where: str
 def _general(problem: Problem, points: Any, normals: Any, c: Condition, where: str) -> Part:
     """A user's residual(u, x, n): its derivatives with respect to the slots by AD."""
     dim, n = points.shape[1], points.shape[0]
-    traced: Traced = trace(c.residual, dim, problem.fields, extras=((dim,),), params=problem.params)
+    arguments = "u, x, n" if problem.params is None else "u, x, n, params"
+    with _named(where, f"residual({arguments}) returning a scalar or a vector"):
+        traced: Traced = trace(c.residual, dim, problem.fields, extras=((dim,),), params=problem.params)
     if not traced.slots:
         raise ValueError(f"{where}: the residual does not depend on u; a condition must involve the solution")
 
@@ -240,6 +275,8 @@ def _general(problem: Problem, points: Any, normals: Any, c: Condition, where: s
         xp = jnp if is_traced(jac, res) else np
         jac = xp.broadcast_to(jac[:, :, 0], (*jac.shape[:2], n))
         value = xp.zeros((jac.shape[0], n)) if res is None else -xp.broadcast_to(res[:, 0], (jac.shape[0], n))
+        if traced.linear and xp is np and not (np.isfinite(jac).all() and np.isfinite(value).all()):
+            raise ValueError(f"{where}: the residual has NaN or infinite coefficients at a particle of this group")
         if not traced.linear:
             value = value + xp.einsum("esn,sn->en", jac, derivatives)
         return xp.transpose(jac, (2, 0, 1)), value.T

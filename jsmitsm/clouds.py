@@ -93,6 +93,8 @@ class Cloud:
             from scipy.spatial import cKDTree
 
             points = np.asarray(self.points)
+            if len(points) < 2:
+                raise ValueError("cloud.spacing: a distance needs at least two particles, the cloud has 1; add some")
             self._spacing = float(cKDTree(points).query(points, k=2)[0][:, 1].min())
         return self._spacing
 
@@ -104,15 +106,15 @@ class Cloud:
     def replace(self, points: Any = None, normals: Any = None) -> Cloud:
         """The same groups with other points or normals (traced values welcome)."""
         new = object.__new__(Cloud)
-        new.points = self.points if points is None else points
-        new.normals = self.normals if normals is None else normals
-        new.groups = self.groups
-        new._spacing = None if points is not None else self._spacing
-        if new.points.shape != self.points.shape:
+        if points is not None and np.shape(points) != self.points.shape:
             raise ValueError(
-                f"points: shape {new.points.shape} came, {self.points.shape} was expected; "
+                f"points: shape {np.shape(points)} came, {self.points.shape} was expected; "
                 "build a new Cloud for another number of particles"
             )
+        new.points = self.points if points is None else _checked_points(points)
+        new.groups = self.groups
+        new.normals = self.normals if normals is None else _checked_normals(normals, new.points, self.groups)
+        new._spacing = None if points is not None else self._spacing
         return new
 
     def __len__(self) -> int:
@@ -147,7 +149,7 @@ def _checked_points(points: Any) -> Any:
                 f"points: expected a real array of shape (N, D), got {type(points).__name__} "
                 "that is not one; pass e.g. np.array([[0.0, 0.0], [1.0, 0.0]])"
             ) from None
-        points = array.astype(np.float32 if array.dtype == np.float32 else np.float64)
+        points = array.astype(np.float32 if array.dtype == np.float32 else np.float64)  # a copy: the user's may change
         shape = points.shape
     if len(shape) != 2 or shape[1] not in (1, 2, 3) or shape[0] == 0:
         hint = "; in 1D use points[:, None]" if len(shape) == 1 else ""
@@ -168,8 +170,6 @@ def _checked_points(points: Any) -> Any:
 
 def _checked_groups(groups: Mapping[str, Any], n: int) -> Groups:
     """Disjoint groups that cover all n particles."""
-    if isinstance(groups, Groups):
-        return groups
     if not isinstance(groups, Mapping) or INTERIOR not in groups:
         raise ValueError(
             f'groups: expected a dict of index arrays with a key "interior", got {_describe_groups(groups)}'
@@ -177,23 +177,30 @@ def _checked_groups(groups: Mapping[str, Any], n: int) -> Groups:
     owner = np.full(n, -1)
     checked = {}
     for k, (name, index) in enumerate(groups.items()):
-        index = np.asarray(index)
-        if index.size == 0:
-            index = index.astype(np.int64).reshape(-1)
-        if index.ndim != 1 or index.dtype.kind not in "iu":
+        if not isinstance(name, str):
+            raise ValueError(f"groups: the name {name!r} of a group is no string; write e.g. {str(name)!r}")
+        try:
+            index = np.asarray(index)
+            if index.size == 0:
+                index = index.astype(np.int64).reshape(-1)
+            if index.ndim != 1 or index.dtype.kind not in "iu":
+                raise ValueError
+        except ValueError:
+            came = f"{index.dtype} of shape {index.shape}" if isinstance(index, np.ndarray) else f"{index!r}"
             raise ValueError(
-                f"groups[{name!r}]: expected a 1D integer index array, got {index.dtype} of shape {index.shape}; "
+                f"groups[{name!r}]: expected a 1D integer index array, got {came}; "
                 "turn a mask into indices with np.flatnonzero"
-            )
+            ) from None
         if index.size and (index.min() < 0 or index.max() >= n):
             raise ValueError(
                 f"groups[{name!r}]: indices from {index.min()} to {index.max()}, expected 0 to {n - 1} "
                 f"for {n} particles"
             )
-        taken = index[owner[index] >= 0]
-        if len(taken) or len(np.unique(index)) != len(index):
+        once, count = np.unique(index, return_counts=True)
+        taken = once[(owner[once] >= 0) | (count > 1)]
+        if len(taken):
             raise ValueError(
-                f"groups[{name!r}]: particles {_some(taken if len(taken) else index)} are in two groups or twice "
+                f"groups[{name!r}]: particles {_some(taken)} are in two groups or twice "
                 "in one; every particle belongs to exactly one group"
             )
         owner[index] = k
@@ -212,7 +219,13 @@ def _checked_normals(normals: Any, points: Any, groups: Groups) -> Any:
         raise ValueError(f"normals: expected shape {points.shape} like points, got {np.shape(normals)}")
     if isinstance(normals, jax.core.Tracer):
         return normals
-    normals = np.array(normals, dtype=np.float64)
+    try:
+        normals = np.asarray(normals)
+        if normals.dtype.kind == "c":
+            raise TypeError
+        normals = normals.astype(np.float64)
+    except (TypeError, ValueError):
+        raise ValueError("normals: expected real numbers, unit vectors that point outward") from None
     normals[groups[INTERIOR]] = np.nan
     length = np.linalg.norm(normals, axis=1)
     bad = np.flatnonzero(np.abs(length - 1) > 1e-6)
@@ -277,8 +290,10 @@ def _lattice(lo, hi, shape, jitter, seed, dim=1, names=("lo", "hi", "shape")) ->
     counts = np.atleast_1d(np.asarray(shape))
     if counts.shape != (dim,) or counts.dtype.kind not in "iu" or (counts < 2).any():
         raise ValueError(f"{names[2]}: expected {dim} whole number(s) of at least 2, got {shape!r}")
-    if not 0.0 <= jitter < 0.5:
-        raise ValueError(f"jitter: expected 0 <= jitter < 0.5 spacings (beyond, particles may meet), got {jitter}")
+    if not isinstance(jitter, (int, float, np.number)) or not 0.0 <= jitter < 0.5:
+        raise ValueError(f"jitter: expected 0 <= jitter < 0.5 spacings (beyond, particles may meet), got {jitter!r}")
+    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
+        raise ValueError(f"seed: expected a whole number from 0, the start of the random numbers, got {seed!r}")
     axes = [np.linspace(a, b, n) for a, b, n in zip(lo, hi, counts)]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, dim)
     place = np.stack(np.meshgrid(*[np.arange(n) for n in counts], indexing="ij"), axis=-1).reshape(-1, dim)
@@ -299,7 +314,10 @@ def _lattice(lo, hi, shape, jitter, seed, dim=1, names=("lo", "hi", "shape")) ->
 
 
 def _checked_corner(value: Any, name: str, dim: int) -> np.ndarray:
-    corner = np.atleast_1d(np.asarray(value, dtype=np.float64))
+    try:
+        corner = np.atleast_1d(np.asarray(value, dtype=np.float64))
+    except (TypeError, ValueError):
+        raise ValueError(f"{name}: expected {dim} finite number(s), got {value!r}") from None
     if corner.shape != (dim,) or not np.isfinite(corner).all():
         raise ValueError(f"{name}: expected {dim} finite number(s), got {value!r}")
     return corner

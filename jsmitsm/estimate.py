@@ -37,7 +37,8 @@ def error_estimate(solution: Solution) -> Any:
     nums = dz.numbers(low, fit.problem, fit.taylor)
     classes, rows = dz.all_rows(low, nums)
     high, high_nums = _higher(fit, low)
-    defect = _per_value(high, *dz.all_rows(high, high_nums), high_nums, solution._values)
+    high_rows = Run(high, fit.problem, "auto", True, True, "loo").local_rows(high_nums)
+    defect = _per_value(high, *high_rows, high_nums, solution._values)
     own = _per_value(low, classes, rows, nums, solution._values)
     free = np.flatnonzero(~low.held.reshape(-1))
     ratio = own[1].reshape(-1)[free] / defect[1].reshape(-1)[free]
@@ -85,7 +86,7 @@ def _per_value(disc: Discretization, classes: Any, rows: Any, nums: Numbers, val
     au = xp.zeros(len(free)).at[r].add(data * u[c]) if traced else np.bincount(r, data * u[c], len(free))
     residual, weight = xp.zeros(disc.held.size), xp.ones(disc.held.size)
     first = np.array(disc.rec.equation_rows)
-    parts = [xp.abs(xp.asarray(row.source)[:, :, first]).max(axis=2) for row in rows]
+    parts = [_strongest(xp.asarray(row.source)[:, :, first], xp) for row in rows]
     ids = np.concatenate([cls.ids for cls in classes])
     strength = xp.concatenate(parts)
     if traced:
@@ -95,6 +96,12 @@ def _per_value(disc: Discretization, classes: Any, rows: Any, nums: Numbers, val
     weight = weight.reshape(disc.held.shape)
     weight[ids] = strength
     return residual.reshape(disc.held.shape), weight
+
+
+def _strongest(weights: Any, xp: Any) -> Any:
+    """Of each row's weights of the sources (n, F, E), the largest in size: (n, F)."""
+    place = xp.argmax(xp.abs(weights), axis=2)
+    return xp.take_along_axis(weights, place[..., None], axis=2)[..., 0]
 
 
 class Factorization:

@@ -24,6 +24,7 @@ _FACETS: dict[str, list[tuple[int, ...]]] = {
 _DIMS = {"vertex": 0} | {
     kind: 1 if kind.startswith("line") else 2 if kind.startswith(("tri", "quad")) else 3 for kind in _FACETS
 }
+_CORNERS = {"line": 2, "triangle": 3, "quad": 4, "tetra": 4, "hexahedron": 8, "wedge": 6, "pyramid": 5}
 _TAGS = ("gmsh:physical", "medit:ref", "cell_tags", "gambit:ref", "su2:tag", "avsucd:material")
 
 
@@ -46,7 +47,7 @@ def boundary_normals(points: np.ndarray, cells: list[tuple[str, np.ndarray]]) ->
     dim = points.shape[1]
     facets, centres = [], []
     for kind, block in cells:
-        corners = block[:, : _corners(_FACETS[kind])]
+        corners = block[:, : _CORNERS[kind.rstrip("0123456789")]]
         for facet in _FACETS[kind]:
             facets += [block[:, list(facet)]]
             centres += [points[corners].mean(axis=1)]
@@ -85,20 +86,9 @@ def _add_normals(total: np.ndarray, points: np.ndarray, facets: np.ndarray, cent
         np.add.at(total, facets[:, k], normal * angle[:, None])
 
 
-def _corners(facets: list[tuple[int, ...]]) -> int:
-    """How many corners a cell has: its nodes of second order come after them."""
-    second = {6: 3, 3: 2}
-    dim_heads = [f[: second.get(len(f), len(f))] if _is_second_order(facets) else f for f in facets]
-    return len(set().union(*dim_heads))
-
-
-def _is_second_order(facets: list[tuple[int, ...]]) -> bool:
-    return facets in (_FACETS["triangle6"], _FACETS["quad8"], _FACETS["tetra10"])
-
-
 def _head(nodes: int, dim: int) -> int:
-    """Corners among the nodes of a facet."""
-    return {1: 1, 2: 2, 3: 3 if nodes == 6 else nodes}[dim] if nodes > 1 else 1
+    """Corners among the nodes of a facet; those of second order come after them."""
+    return {1: 1, 2: 2, 3: 3 if nodes == 6 else nodes}[dim]
 
 
 def _padded(rows: np.ndarray) -> np.ndarray:

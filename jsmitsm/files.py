@@ -83,7 +83,7 @@ def from_mesh(mesh: Any, tags: str | None = None) -> Cloud:
         claimed = nodes[free[nodes]]  # tags inside of the domain are no boundary
         if len(claimed):
             if name == INTERIOR:
-                raise ValueError(f"mesh: a boundary group is called {INTERIOR!r}, the name of what lies inside; rename")
+                raise ValueError(f"mesh: boundary facets are tagged {INTERIOR!r}, the name of what lies inside; rename")
             groups[name] = claimed
             free[claimed] = False
     if free.any():

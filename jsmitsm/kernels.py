@@ -44,6 +44,7 @@ class Kernel:
         self._profile = profile
         self.params = params
         self._set(h, d)
+        _check_profile(self)
 
     def _set(self, h: Any, d: Any) -> None:
         self.h, self.d = _checked(h, "h", (0, 1)), _checked(d, "d", (0,))
@@ -66,6 +67,9 @@ class Kernel:
         if unknown:
             raise ValueError(f"{unknown[0]}: no parameter of {type(self).__name__}; it has 'h', 'd' and 'params'")
         _, aux = self.tree_flatten()
+        for name, dims in (("h", (0, 1)), ("d", (0,))):
+            if name in changes:
+                changes[name] = _checked(changes[name], name, dims)
         leaves = tuple(changes.get(name, getattr(self, name)) for name in ("h", "d", "params"))
         return type(self).tree_unflatten(aux, leaves)
 
@@ -109,6 +113,8 @@ class SuperGaussian(_Named):
 
     def normalization(self, dim: int) -> Any:
         """The constant G / (h sqrt(pi))^D of eq. (30)."""
+        if dim not in (1, 2, 3):
+            raise ValueError(f"dim: expected 1, 2 or 3 dimensions, got {dim!r}")
         return (1.04823, 1.10081, 1.18516)[dim - 1] / (self.h * np.sqrt(np.pi)) ** dim
 
 
@@ -176,17 +182,28 @@ def _checked(value: Any, name: str, dims: tuple[int, ...]) -> Any:
     if isinstance(value, jax.core.Tracer):
         return value
     try:
-        array = np.asarray(value, dtype=np.float64) if not hasattr(value, "dtype") else np.asarray(value)
+        array = np.asarray(value)
         if array.dtype.kind not in "fiu":
             raise TypeError
     except (TypeError, ValueError):
         raise ValueError(f"{name}: expected a positive number, got {value!r}") from None
-    if array.ndim not in dims:
+    if array.ndim not in dims or not array.size:
         kinds = "a scalar or an (N,) array" if 1 in dims else "a scalar"
         raise ValueError(f"{name}: expected {kinds}, got an array of shape {array.shape}")
     if not (np.isfinite(array) & (array > 0)).all():
         raise ValueError(f"{name}: expected positive finite values, got {_short(array)}; {name} scales the support")
     return float(array) if array.ndim == 0 and not isinstance(value, jax.Array) else value
+
+
+def _check_profile(kernel: Kernel) -> None:
+    """Call a user's profile once without numbers: its signature and shape come to light."""
+    said = "profile: expected a jax.numpy function of the scaled distance r (and of params, where given)"
+    try:
+        shape = np.shape(jax.eval_shape(kernel.profile, jax.ShapeDtypeStruct((), jnp.result_type(float))))
+    except Exception as error:
+        raise ValueError(f"{said}, but calling it failed: {error}") from error
+    if shape != ():
+        raise ValueError(f"{said} that returns a scalar for a scalar, got shape {shape}")
 
 
 def _short(value: Any) -> str:

@@ -73,7 +73,7 @@ def solve(
         multiplier, is an unknown without a place and is eliminated last.
       solver: "dense" (LAPACK; pure JAX where anything is traced), "sparse" (LU), "iterative"
         (BiCGSTAB with multigrid, where pyamg is installed, or incomplete LU; it falls back to the
-        direct solver where it stalls) or "auto": dense up to 300 unknowns, then direct, and
+        direct solver where it stalls) or "auto": dense up to 190 unknowns, then direct, and
         multigrid for the large elliptic systems where it was measured to be faster.
       elliptic: False keeps "auto" away from multigrid.
       refine: steps of iterative refinement done in any case; 0 switches it off.

@@ -61,6 +61,8 @@ def stencils(cloud: Cloud, *, size: int | None = None, radius: Any = None) -> St
     >>> js.stencils(js.rectangle((0, 0), (1, 1), (9, 9)), size=9)
     Stencils(81 particles, at most 9 neighbours each, themselves counted)
     """
+    if not isinstance(cloud, Cloud):
+        raise ValueError(f"cloud: expected a js.Cloud, got {type(cloud).__name__}; build one with js.Cloud(points, groups)")
     if isinstance(cloud.points, jax.core.Tracer):
         raise ValueError(
             "cloud: its points are traced by a JAX transform, and neighbours are found on the host; "
@@ -71,7 +73,7 @@ def stencils(cloud: Cloud, *, size: int | None = None, radius: Any = None) -> St
     points = np.asarray(cloud.points)
     if size is None:
         return within(points, radius)
-    if isinstance(size, bool) or int(size) != size or size < 2:
+    if isinstance(size, bool) or not isinstance(size, (int, np.integer)) or size < 2:
         raise ValueError(f"size: expected a whole number of at least 2 (the particle itself counts), got {size!r}")
     return nearest(points, int(size))
 
@@ -102,7 +104,10 @@ def nearest(points: np.ndarray, size: int, which: np.ndarray | None = None) -> S
 def within(points: np.ndarray, radius: Any, which: np.ndarray | None = None) -> Stencils:
     """All particles within ``radius``, of all particles or of those in ``which``."""
     centres = points if which is None else points[which]
-    radius = np.asarray(radius, dtype=np.float64)
+    try:
+        radius = np.asarray(radius, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ValueError(f"radius: expected a positive scalar or ({len(centres)},) array, got {radius!r}") from None
     if radius.shape not in ((), (len(centres),)) or not (np.isfinite(radius) & (radius > 0)).all():
         raise ValueError(f"radius: expected a positive scalar or ({len(centres)},) array, got shape {radius.shape}")
     from scipy.spatial import cKDTree

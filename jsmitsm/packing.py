@@ -194,11 +194,11 @@ def _scatter(
     """A start of the right density: octree cells of at most one particle each, dithered along a Morton curve."""
     dim = len(lo)
     fraction = _DENSITY[dim] ** (-1.0 / dim)
-    base = 0.0
+    base, period = 0.0, float((hi - lo).max()) / 100
     if uniform:  # cells of exactly one particle: the start is a jittered lattice
-        base = fraction * float(spacing(lo[None])[0])
+        base = period = fraction * float(spacing(lo[None])[0])
         base *= 2.0 ** max(0.0, np.floor(np.log2((hi - lo).max() / BASE[dim] / base)))
-    shift = rng.uniform(0.0, 0.5, dim) * fraction * spacing_at_most(spacing, lo, hi, uniform)
+    shift = rng.uniform(0.0, 0.5, dim) * period
     cells, _ = refine(region, spacing, lo - shift, hi + shift, fraction, True, base)
     order = np.argsort(morton(cells.centers, lo, hi), kind="stable")
     cells = _take(cells, order)
@@ -207,11 +207,6 @@ def _scatter(
     jitter = rng.uniform(-0.45, 0.45, (len(expected), dim)) * cells.widths[:, None]
     points = (cells.centers + jitter)[chosen]
     return points[region.distance(points)[0] < 0]
-
-
-def spacing_at_most(spacing: Spacing, lo: np.ndarray, hi: np.ndarray, uniform: bool) -> float:
-    """The spacing where it is constant; a hundredth of the box otherwise, a harmless shift of the lattice."""
-    return float(spacing(lo[None])[0]) if uniform else float((hi - lo).max()) / 100
 
 
 def morton(points: np.ndarray, lo: np.ndarray, hi: np.ndarray) -> np.ndarray:

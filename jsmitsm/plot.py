@@ -208,7 +208,7 @@ def sparsity(what: Any, *, ax: Any = None) -> Any:
         rows, columns, shape = matrix.row, matrix.col, matrix.shape
     ax = drawing.axes(ax, 2)
     # More rows than a screen has pixels: one pixel stands for a block, the darker the fuller.
-    bins = [min(n, 600) for n in shape]
+    bins = [-(-n // -(-n // 600)) for n in shape]
     picture = np.histogram2d(rows, columns, bins=bins, range=[(-0.5, n - 0.5) for n in shape])[0]
     extent = (-0.5, shape[1] - 0.5, shape[0] - 0.5, -0.5)
     ax.imshow(picture ** 0.5, cmap="Greys", vmin=0, extent=extent, interpolation="nearest")
@@ -247,9 +247,7 @@ def tuning(result: Any, *, ax: Any = None) -> Any:
                 one.set_yscale("log")
             best = int(np.nanargmin(track))
             one.plot(best, track[best], "o", color="k", markersize=7, fillstyle="none")
-            text = f"best {track[best]:.3g}"
-            one.annotate(text, (best, track[best]), (0, 9), textcoords="offset points", ha="center")
-            one.margins(y=0.25)
+            one.set_title(f"best {track[best]:.3g} at step {best}", loc="right", fontsize="small")
         drawing.labels(one, "step" if k == len(panels) - 1 else "", name)
     return axes
 

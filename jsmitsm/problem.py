@@ -78,7 +78,11 @@ def robin(a: Any, b: Any, value: Any, field: int | None = None) -> Condition:
     >>> js.robin(1.0, 2.0, 0.0)
     robin(a=1.0, b=2.0, value=0.0)
     """
-    return Condition("robin", _field(field), a=_value(a, "a"), b=_value(b, "b"), value=_value(value, "value"))
+    a, b = _value(a, "a"), _value(b, "b")
+    known = not any(callable(v) or isinstance(v, jax.core.Tracer) for v in (a, b))
+    if known and np.any((np.asarray(a) == 0) & (np.asarray(b) == 0)):
+        raise ValueError("robin: a and b are both zero, which states nothing of u; give one of them, or js.free()")
+    return Condition("robin", _field(field), a=a, b=b, value=_value(value, "value"))
 
 
 def condition(residual: Callable[..., Any]) -> Condition:
@@ -120,6 +124,8 @@ def fix(indices: Any, value: Any, field: int | None = None) -> Condition:
     index = np.atleast_1d(np.asarray(indices))
     if index.ndim != 1 or index.dtype.kind not in "iu" or not index.size:
         raise ValueError(f"indices: expected particle numbers, got {indices!r}")
+    if index.min() < 0 or len(np.unique(index)) != len(index):
+        raise ValueError(f"indices: particles are numbered from 0 and given once each, got {index.tolist()}")
     return Condition("fix", _field(field), indices=tuple(int(i) for i in index), value=_value(value, "value"))
 
 
@@ -195,6 +201,7 @@ class Problem:
                 f"bcs: expected a dict from group name to condition, got {type(bcs).__name__}; "
                 'write e.g. {"left": js.dirichlet(0.0)}'
             )
+        _check_params(params)
         self.pde = pde
         self.fields = int(fields)
         self.params = params
@@ -223,8 +230,22 @@ class Problem:
         return f"Problem(fields={self.fields}, {shown.replace('; ', ', ')})"
 
 
+def _check_params(params: Any) -> None:
+    """Parameters are finite numbers; traced ones pass."""
+    for path, leaf in jax.tree_util.tree_leaves_with_path(params):
+        if isinstance(leaf, jax.core.Tracer):
+            continue
+        where = f"params{jax.tree_util.keystr(path)}"
+        if getattr(leaf, "dtype", np.asarray(leaf).dtype if np.isscalar(leaf) else np.dtype(object)).kind not in "biuf":
+            raise ValueError(f"{where}: expected a real number or array, got {leaf!r}; let the pde close over it instead")
+        if not np.isfinite(np.asarray(leaf)).all():
+            raise ValueError(f"{where}: NaN or infinite numbers; give finite ones")
+
+
 def _listed(name: Any, value: Any, fields: int) -> list[Condition]:
     """The conditions of one group as a list."""
+    if not isinstance(name, str):
+        raise ValueError(f"bcs: the key {name!r} is no string; use the name of a boundary group")
     given = list(value) if isinstance(value, (list, tuple)) else [value]
     for c in given:
         if not isinstance(c, Condition):

@@ -10,6 +10,8 @@ import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
+from jsmitsm.jaxprs import derivative
+
 _KEPT = 256
 _programs: OrderedDict[Any, Any] = OrderedDict()
 
@@ -24,8 +26,11 @@ def kept(key: Any, make: Callable[[], Any]) -> Any:
     return _programs[key]
 
 
-def fingerprint(jaxpr: Any) -> Any:
-    """A hashable value, equal for jaxprs that compute the same in the same way."""
+def fingerprint(jaxpr: Any, rules: bool = True) -> Any:
+    """A hashable value, equal for jaxprs that compute the same in the same way.
+
+    ``rules``: a function with a derivative rule of its own is told apart by what the rule computes too.
+    """
     number: dict[Any, int] = {}
 
     def name(v: Any) -> Any:
@@ -40,10 +45,22 @@ def fingerprint(jaxpr: Any) -> Any:
 
     head = declare(jaxpr.constvars), declare(jaxpr.invars)
     body = tuple(
-        (eqn.primitive.name, tuple(map(name, eqn.invars)), declare(eqn.outvars), _parameters(eqn.params))
+        (
+            eqn.primitive.name, tuple(map(name, eqn.invars)), declare(eqn.outvars), _parameters(eqn.params),
+            _rule(eqn, rules),
+        )
         for eqn in jaxpr.eqns
-    )
+    )  # fmt: skip
     return head, body, tuple(map(name, jaxpr.outvars))
+
+
+def _rule(eqn: Any, rules: bool) -> Any:
+    """What the derivative rule of a custom_jvp function computes; rules inside rules go by their name."""
+    if eqn.primitive.name != "custom_jvp_call" or not rules:
+        return None
+    active = tuple(k for k, v in enumerate(eqn.invars) if np.issubdtype(v.aval.dtype, np.inexact))
+    jaxpr, consts = derivative(eqn, active)
+    return fingerprint(jaxpr, False), tuple(map(_parameters, consts))
 
 
 def _parameters(value: Any) -> Any:
@@ -60,6 +77,9 @@ def _parameters(value: Any) -> Any:
     if isinstance(value, np.ndarray | jax.Array):
         value = np.asarray(value)
         return value.dtype.str, value.shape, value.tobytes()
+    source = getattr(getattr(value, "debug_info", None), "func_src_info", None)
+    if source is not None:  # a derivative rule, wrapped anew at every trace
+        return source
     try:
         hash(value)
     except TypeError:

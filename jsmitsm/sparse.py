@@ -20,7 +20,9 @@ from jsmitsm.backends import BACKENDS, ITERATIVE, SuperLU, installed
 from jsmitsm.errors import SolveError
 from jsmitsm.ordering import nested_dissection
 
-DENSE_MAX = 300  # unknowns: below, LAPACK beats every sparse code
+# Unknowns up to which LAPACK beats the sparse codes. From 200 on it would use several threads, which
+# on a busy machine wait for one another a hundred times longer than they work.
+DENSE_MAX = 190
 # Unknowns from which multigrid was faster than LU, refined to round-off and with one adjoint solve.
 ITERATIVE_MIN = {2: 200_000, 3: 6_000}
 BACKWARD_ERROR = 1e-9  # what is accepted of a direct solver
@@ -48,7 +50,7 @@ def estimate_memory(n: int, nnz: int, dim: int) -> int:
 
     Example:
       >>> round(estimate_memory(102_400, 2_037_720, 2) / 1e6)
-      447
+      435
     """
     n, per_row = max(int(n), 2), nnz / max(int(n), 1)
     if dim >= 3:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -22,8 +23,8 @@ from jsmitsm.program import fingerprint, kept
 from jsmitsm.series import Ring, full_series, variable
 from jsmitsm.taylor import count
 
-# Particles interpreted at a time on the host: the temporaries stay in cache.
-CHUNK = 2048
+# Particles interpreted at a time on the host: the temporaries stay in cache.  Fewer where arrays are wide.
+CHUNK = 4096
 # How many programs were traced for compilation since import; tests watch it.
 COMPILATIONS = 0
 
@@ -113,9 +114,8 @@ class Traced:
             return self._compiled(inputs, degree, jac, res)
         inputs = jax.tree.map(np.asarray, inputs)
         n = len(inputs.points)
-        parts = [
-            self._series(inputs.chunk(low), degree, jac, res) for low in range(0, max(n, 1), CHUNK)
-        ]
+        size = max(CHUNK // self._width, CHUNK // 8, 1)
+        parts = [self._series(inputs.chunk(low, size), degree, jac, res) for low in range(0, max(n, 1), size)]
         if len(parts) == 1:
             return parts[0]
         return tuple(None if p[0] is None else np.concatenate(p, -1) for p in zip(*parts, strict=True))  # type: ignore
@@ -182,6 +182,12 @@ class Traced:
         return value(matrix), None if result is None else value(result)
 
     @cached_property
+    def _width(self) -> int:
+        """The most elements of an intermediate value."""
+        sizes = [math.prod(v.aval.shape) for eqn in self._record.jaxpr.eqns for v in eqn.outvars]
+        return max(sizes, default=1) or 1
+
+    @cached_property
     def _fingerprint(self) -> Any:
         return fingerprint(self._record.jaxpr)
 
@@ -236,8 +242,8 @@ class _Inputs:
         extras, leaves, consts = (some(name, getattr(self, name)) for name in ("extras", "leaves", "consts"))
         return _Inputs(points, extras, leaves, consts, slots)
 
-    def chunk(self, low: int) -> _Inputs:
-        cut = slice(low, low + CHUNK)
+    def chunk(self, low: int, size: int) -> _Inputs:
+        cut = slice(low, low + size)
         slots = None if self.slots is None else self.slots[..., cut]
         return self._replace(points=self.points[cut], extras=[e[cut] for e in self.extras], slots=slots)
 

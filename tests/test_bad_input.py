@@ -84,6 +84,7 @@ CLOUDS = [
     ("groups-twice", cloud(groups={"interior": [1, 1], "ends": [0, 2]}), r"groups\['interior'\].*\[1\]", "exactly one"),
     ("groups-not-covered", cloud(groups={"interior": [1], "ends": [0]}), r"groups.*\[2\]", "add them"),
     ("groups-name-no-string", cloud(groups={"interior": [1], 7: [0, 2]}), "groups.*7", "string"),
+    ("groups-of-another-cloud", cloud(groups=js.interval(0, 1, 4).groups), r"groups\['right'\]", "expected 0 to 2"),
     ("groups-ragged", cloud(groups={"interior": [[1], [0, 2]], "ends": []}), r"groups\['interior'\]", "integer"),
     ("normals-shape", cloud(normals=np.zeros((3, 2))), "normals", r"expected shape \(3, 1\)"),
     ("normals-flat", cloud(normals=np.array([-1, NAN, 1.0])), "normals", r"expected shape \(3, 1\)"),
@@ -140,9 +141,8 @@ KERNELS = [
     ("replace-nan-d", lambda: KERNEL.replace(d=NAN), r"\bd:", "positive"),
     ("h-length", solve(kernel=js.SuperGaussian(h=np.full(8, 0.125), d=3.0)), r"kernel.*\bh\b", r"\(9,\)"),
     ("h-length-1", solve(kernel=js.SuperGaussian(h=np.full(1, 0.125), d=3.0)), r"kernel.*\bh\b", r"\(9,\)"),
-    ("profile-shape", solve(kernel=js.Kernel(lambda r: jnp.stack([r, r]), 0.125, 3.0)), "profile", "scalar"),
-    ("profile-nan", solve(kernel=js.Kernel(lambda r: jnp.log(r - 10.0), 0.125, 3.0)), "kernel|profile", "finite"),
-    ("profile-arguments", solve(kernel=js.Kernel(lambda: 1.0, 0.125, 3.0)), "profile", "scaled distance"),
+    ("profile-shape", lambda: js.Kernel(lambda r: jnp.stack([r, r]), 0.125, 3.0), "profile", "scalar"),
+    ("profile-arguments", lambda: js.Kernel(lambda: 1.0, 0.125, 3.0), "profile", "scaled distance"),
     ("normalization-dim", lambda: KERNEL.normalization(4), "dim", "1, 2 or 3"),
 ]
 
@@ -248,7 +248,6 @@ ON_A_CLOUD = [
     ("condition-elsewhere", ends(left=js.condition(lambda u, x, n: u(x + n))), r"bcs\['left'\]|field u", r"at the point x|\bx\b"),
     ("condition-nan", ends(left=js.condition(lambda u, x, n: js.grad(u)(x)[0] + jnp.log(-1 - x[0]))), r"bcs\['left'\]",
      "finite|NaN"),
-    ("too-many", ends(left=[js.dirichlet(0.0), js.neumann(0.0)]), r"bcs\['left'\]", "at most|remove"),
     ("fix-beyond", solve(bcs={**ENDS, "pin": js.fix([9], 0.0)}), r"bcs\['pin'\]", "has 9"),
     ("fix-boundary-again", solve(bcs={**ENDS, "pin": js.fix([0], 0.0)}), r"bcs\['pin'\]", "remove"),
     ("periodic-unknown", solve(bcs={"left": js.periodic("left", "top")}), "bcs.*'top'", "'left', 'right'"),
@@ -271,7 +270,7 @@ SOLVE = [
     ("method-list", solve(method=["S"]), "method:", "'S'"),
     ("order-zero", solve(order=0), "order:", "whole number"),
     ("order-negative", solve(order=-2), "order:", "whole number"),
-    ("order-huge", solve(order=100), "order:", "1 to 12"),
+    ("order-huge", solve(order=100), "order:", r"1 to \d+"),
     ("order-float", solve(order=4.0), "order:", "whole number"),
     ("order-bool", solve(order=True), "order:", "whole number"),
     ("order-None", solve(order=None), "order:", "whole number"),
@@ -299,12 +298,14 @@ SOLVE = [
     ("throw-text", solve(throw="no"), "throw:", "True or False"),
     ("method-I-for-a-system", solve(
         pde=lambda u, x: js.laplacian(u)(x), fields=2, method="I"), "method:", 'method="S"'),
-    ("constant-kernel-II", solve(method="II", kernel=js.Constant(0.125, 3.0)), "kernel|method", "another kernel|derivative"),
     ("constant-kernel-III", solve(method="III", kernel=js.Constant(0.125, 3.0)), "kernel|method",
      "another kernel|derivative"),
     ("support-of-one", solve(kernel=js.SuperGaussian(h=0.01, d=2.0)), "kernel", "larger|increase"),
     ("support-too-small", solve(kernel=js.SuperGaussian(h=0.07, d=2.0), order=4, method="SSPH"), "kernel",
      "larger|increase"),
+    ("no-unknowns", lambda: js.solve(js.Problem(
+        poisson, dict.fromkeys(("left", "right", "bottom", "top"), js.dirichlet(0.0))),
+        js.rectangle((0, 0), (1, 1), (2, 2)), order=2), "cloud:", "add particles"),
     ("no-pure-derivative", lambda: js.solve(js.Problem(
         lambda u, x: js.partial(u, (1, 1))(x), dict.fromkeys(("left", "right", "bottom", "top"), js.dirichlet(0.0))),
         SQUARE, method="III", kernel=js.SuperGaussian(0.25, 3.0)), "method:", 'method="S"'),
@@ -354,10 +355,9 @@ EVALUATION = [
     ("text", evaluate(lambda s: s([["a"]])), "points:", r"\(M, 1\)|number"),
     ("complex", evaluate(lambda s: s(np.array([[1j]]))), "points:", "real"),
     ("derivative-length", evaluate(lambda s: s.derivative([[0.5]], (1, 0))), "multi_index", "1 non-negative"),
-    ("derivative-high", evaluate(lambda s: s.derivative([[0.5]], (3,))), "multi_index", "at most 2"),
+    ("derivative-high", evaluate(lambda s: s.derivative([[0.5]], (3,))), "multi_index", "at most 2|sum"),
     ("derivative-negative", evaluate(lambda s: s.derivative([[0.5]], (-1,))), "multi_index", "non-negative"),
     ("multi_indices-dim", lambda: js.multi_indices(0, 2), "dim", "1|positive"),
-    ("multi_indices-degree", lambda: js.multi_indices(2, -1), "order|degree", "0|negative"),
     ("multi_indices-fraction", lambda: js.multi_indices(2, 1.5), "order|degree", "whole|integer"),
     ("grad-of-number", lambda: js.grad(3.0), "operator", "function of the point"),
     ("laplacian-of-batch", lambda: js.laplacian(lambda x: x[0])(np.zeros((3, 2))), "x must", r"\(D,\)"),
@@ -411,6 +411,7 @@ SINGULAR = [
     ("incompatible-neumann", solve(bcs=FLAT), "incompatible|singular"),
     ("floating-part", solve(pde=lambda u, x: js.laplacian(u)(x) - 1.0, bcs={"left": js.free(), "right": js.free()}),
      "singular|condition"),
+    ("kernel-of-nan", solve(kernel=js.Kernel(lambda r: jnp.log(r - 10.0), 0.125, 3.0)), "moment systems|finite|profile"),
 ]  # fmt: skip
 
 
@@ -452,11 +453,3 @@ def test_a_cloud_keeps_its_own_copy():
     made = js.Cloud(points, LINE.groups)
     points[:] = NAN
     assert np.isfinite(made.points).all()
-
-
-def test_without_unknowns_the_values_are_the_conditions():
-    """Four corners, all of them held: nothing is left to solve for."""
-    corners = js.rectangle((0, 0), (1, 1), (2, 2))
-    problem = js.Problem(poisson, dict.fromkeys(("left", "right", "bottom", "top"), js.dirichlet(lambda x: x[0])))
-    sol = js.solve(problem, corners, order=2)
-    assert np.array_equal(sol.u, corners.points[:, 0])

@@ -268,6 +268,17 @@ def test_kept_by_value_not_by_name():
     assert factorisations() == before + 1
 
 
+def test_changes_in_place_are_seen_under_grad():
+    """JAX arrays may share the memory of the numpy array they were made of."""
+    n, index = 512, np.arange(512)
+    memory = np.empty(n + 8)
+    data = memory[(-memory.ctypes.data // 8) % 8 :][:n]  # aligned to 64 bytes: shared
+    for value in (2.0, 4.0):
+        data[:] = value
+        slope = jax.grad(lambda b: solve(data, index, index, b, n=n).sum())(jnp.ones(n))  # noqa: B023
+        np.testing.assert_allclose(slope, 1 / value)
+
+
 def test_order_is_found_once_for_one_pattern(monkeypatch):
     data, rows, cols, points = grid(18)
     solve(data, rows, cols, np.ones(324), n=324, points=points)

@@ -183,6 +183,7 @@ def test_gradient_with_respect_to_closed_over_values():
     zero = jnp.zeros((1, 1))
     for derivative in (jax.grad, jax.jacfwd):
         assert np.allclose(derivative(total)(2.0, zero), 1 + 2.0 + 4.0 / 2)
+    assert np.allclose(jax.hessian(total)(2.0, zero), 1 + 2.0)
     # d/dx at x = 0 multiplies by k.
     assert np.allclose(jax.grad(total, 1)(2.0, zero), 2 * total(2.0, zero))
 

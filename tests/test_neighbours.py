@@ -1,0 +1,108 @@
+"""Stencils against a search by brute force."""
+
+import jax
+import manufactured as mm
+import numpy as np
+import pytest
+
+import jsmitsm as js
+
+CLOUDS = [mm.jittered(1, 12), mm.jittered(2, 7), mm.jittered(3, 4)]
+
+
+def distances(cloud):
+    return np.linalg.norm(cloud.points[:, None] - cloud.points[None], axis=2)
+
+
+def members(stencils):
+    return [set(row[row >= 0].tolist()) for row in np.asarray(stencils.indices)]
+
+
+def check_layout(stencils, n):
+    """The particle itself first, -1 only behind, nobody twice, no column of -1 alone."""
+    index = np.asarray(stencils.indices)
+    assert len(stencils) == n and index.dtype == np.int32 and stencils.width == index.shape[1]
+    assert np.array_equal(index[:, 0], np.arange(n))
+    assert (np.diff((index >= 0).astype(int), axis=1) <= 0).all()
+    assert (index >= 0).any(axis=0).all()
+    assert all(len(row[row >= 0]) == len(set(row[row >= 0].tolist())) for row in index)
+
+
+@pytest.mark.parametrize("cloud", CLOUDS, ids=["1D", "2D", "3D"])
+@pytest.mark.parametrize("size", [2, 5, 9])
+def test_nearest(cloud, size):
+    found = js.stencils(cloud, size=size)
+    check_layout(found, len(cloud))
+    apart = distances(cloud)
+    reach = np.sort(apart, axis=1)[:, size - 1]
+    for i, ids in enumerate(members(found)):
+        assert ids == set(np.flatnonzero(apart[i] <= reach[i] * (1 + 1e-6)).tolist())
+    assert np.allclose(found.radius, reach, rtol=1e-6)
+
+
+@pytest.mark.parametrize("cloud", CLOUDS, ids=["1D", "2D", "3D"])
+@pytest.mark.parametrize("varying", [False, True])
+def test_within_a_radius(cloud, varying):
+    radius = np.linspace(0.15, 0.6, len(cloud)) if varying else 0.4
+    found = js.stencils(cloud, radius=radius)
+    check_layout(found, len(cloud))
+    apart = distances(cloud)
+    for i, ids in enumerate(members(found)):
+        assert ids == set(np.flatnonzero(apart[i] <= np.broadcast_to(radius, len(cloud))[i]).tolist())
+
+
+def test_a_radius_that_reaches_nobody():
+    found = js.stencils(CLOUDS[1], radius=1e-6)
+    assert found.width == 1 and members(found) == [{i} for i in range(len(CLOUDS[1]))]
+
+
+@pytest.mark.parametrize("size, shell", [(2, 5), (5, 5), (6, 9), (10, 13), (14, 21), (22, 25)])
+def test_shells_of_a_lattice_are_closed(size, shell):
+    """An interior particle's shells on a square lattice hold 5, 9, 13, 21, 25, ... particles."""
+    cloud = js.rectangle((0, 0), (1, 1), (9, 9))
+    middle = int(np.argmin(np.linalg.norm(cloud.points - 0.5, axis=1)))
+    assert len(members(js.stencils(cloud, size=size))[middle]) == shell
+
+
+def test_many_ties_are_all_found():
+    """A ring around its centre: 24 particles at one distance, six asked for."""
+    angle = 2 * np.pi * np.arange(24) / 24
+    points = np.concatenate([[[0.0, 0.0]], np.stack([np.cos(angle), np.sin(angle)], axis=1)])
+    cloud = js.Cloud(points, {"interior": [0], "ring": np.arange(1, 25)})
+    found = js.stencils(cloud, size=6)
+    assert members(found)[0] == set(range(25))
+    check_layout(found, 25)
+
+
+def test_the_edge_of_a_radius_is_included():
+    """0.3 = 3 * 0.1 holds in decimals, not in binary: rounding must not drop the particle."""
+    cloud = js.interval(0.0, 1.0, 11)
+    assert members(js.stencils(cloud, radius=0.3))[5] == {2, 3, 4, 5, 6, 7, 8}
+
+
+def test_the_whole_cloud():
+    found = js.stencils(CLOUDS[0], size=len(CLOUDS[0]))
+    assert members(found) == [set(range(12))] * 12
+
+
+def test_renumbering_renumbers_the_stencils():
+    cloud = CLOUDS[1]
+    order = np.random.default_rng(0).permutation(len(cloud))
+    place = np.argsort(order)
+    shuffled = js.Cloud(cloud.points[order], {name: place[ids] for name, ids in cloud.groups.items()})
+    before, after = members(js.stencils(cloud, size=9)), members(js.stencils(shuffled, size=9))
+    assert [{int(order[k]) for k in after[place[i]]} for i in range(len(cloud))] == before
+
+
+@pytest.mark.parametrize("scale, shift", [(1e-8, 0.0), (1e8, 0.0), (1.0, 1e4)])
+def test_units_and_origin_do_not_matter(scale, shift):
+    cloud = js.rectangle((0, 0), (1, 1), (9, 9))
+    moved = cloud.replace(points=cloud.points * scale + shift)
+    assert members(js.stencils(cloud, size=9)) == members(js.stencils(moved, size=9))
+
+
+def test_stencils_are_a_pytree_and_print_briefly():
+    found = js.stencils(CLOUDS[1], size=9)
+    leaves, shape = jax.tree.flatten(found)
+    assert len(leaves) == 2 and np.array_equal(jax.tree.unflatten(shape, leaves).indices, found.indices)
+    assert "49 particles" in repr(found) and len(repr(found)) < 100
