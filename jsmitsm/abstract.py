@@ -72,7 +72,7 @@ def _step(eqn: Any, facts: list[Facts]) -> list[Facts]:
     name = eqn.primitive.name
     inner = called(eqn)
     if inner is not None:
-        args = facts[len(facts) - len(inner.jaxpr.invars):]
+        args = facts[len(facts) - len(inner.jaxpr.invars) :]
         return interpret(inner.jaxpr, [constant(c) for c in inner.consts], args)
     if all(f.known.all() for f in facts):
         out = _host(eqn, [f.value for f in facts])
@@ -249,7 +249,7 @@ def _scan(eqn: Any, facts: list[Facts]) -> list[Facts] | None:
     if p["length"] > UNROLL:
         return None
     n, m = p["num_consts"], p["num_carry"]
-    fixed, carry, rows = facts[:n], facts[n:n + m], facts[n + m:]
+    fixed, carry, rows = facts[:n], facts[n : n + m], facts[n + m :]
     consts = [constant(c) for c in p["jaxpr"].consts]
     order = range(p["length"])
     outs: dict[int, list[Facts]] = {}

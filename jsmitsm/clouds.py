@@ -257,7 +257,9 @@ def interval(a: float, b: float, n: int) -> Cloud:
     return _lattice((a,), (b,), (n,), 0.0, 0, names=("a", "b", "n"))
 
 
-def rectangle(lo: Sequence[float], hi: Sequence[float], shape: Sequence[int], jitter: float = 0.0, seed: int = 0) -> Cloud:
+def rectangle(
+    lo: Sequence[float], hi: Sequence[float], shape: Sequence[int], jitter: float = 0.0, seed: int = 0
+) -> Cloud:
     """A lattice of ``shape = (nx, ny)`` particles on the rectangle from ``lo`` to ``hi``.
 
     Groups: interior, left, right, bottom, top; a corner belongs to the first that claims it, in

@@ -101,11 +101,11 @@ def at_points(function: Callable, points: np.ndarray) -> np.ndarray:
 
 
 def floor(numbers: np.ndarray) -> float:
-    """Where a logarithmic scale ends: zeros (held particles) must not stretch it without bound."""
+    """Where a logarithmic scale ends: round-off at held particles must not stretch it."""
     positive = numbers[numbers > 0]
     if not len(positive):
         return 1e-16
-    return float(max(np.percentile(positive, 2), positive.max() * 1e-8))
+    return float(max(np.median(positive) * 1e-2, positive.max() * 1e-8, positive.min()))
 
 
 def neighbours(what: Stencils | Solution) -> np.ndarray:
@@ -177,10 +177,14 @@ def maps(cloud: Cloud, numbers: np.ndarray, anywhere: Callable | None, at: Mappi
     if hi - lo <= 1e-12 * max(abs(lo), abs(hi), 1e-300):
         lo, hi = lo - 0.5, hi + 0.5
     bounds = MaxNLocator(levels + 1).tick_values(lo, hi)
+    # A level that rounding alone reaches would promise values that do not occur.
+    slack = 1e-2 * (hi - lo)
+    bounds = bounds[int(bounds[1] <= lo + slack) : len(bounds) - int(bounds[-2] >= hi - slack)]
     many = cloud.dim == 3
     size = (3.6, 3.4) if many else page(np.asarray(cloud.points))
     drawn = panels(given, len(pieces), size)
     for ax, (xy, triangles, z), (axis, position) in zip(drawn, pieces, _places(cloud, at)):
+        z = np.clip(z, bounds[0], bounds[-1])
         filled = ax.tricontourf(*xy.T, triangles, z, levels=bounds, cmap="cividis" if log else "viridis")
         ax.set_aspect("equal")
         names = [n for k, n in enumerate(_NAMES[: cloud.dim]) if k != axis]

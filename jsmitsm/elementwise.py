@@ -92,8 +92,11 @@ def plain_elementwise(eqn: Any, vals: list[Array]) -> Array:
             dtype = eqn.outvars[0].aval.dtype
             return out if out.dtype == dtype else out.astype(dtype)
         if name == "integer_pow":
-            return vals[0] ** np.asarray(eqn.params["y"], vals[0].dtype) if eqn.params["y"] < 0 else (
-                vals[0] ** eqn.params["y"])
+            return (
+                vals[0] ** np.asarray(eqn.params["y"], vals[0].dtype)
+                if eqn.params["y"] < 0
+                else (vals[0] ** eqn.params["y"])
+            )
         if name == "round":
             return np.round(vals[0]) if _to_even(eqn) else np.trunc(vals[0] + np.copysign(0.5, vals[0]))
     shape = np.broadcast_shapes(*(v.shape for v in vals))

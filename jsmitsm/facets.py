@@ -56,8 +56,8 @@ def boundary_normals(points: np.ndarray, cells: list[tuple[str, np.ndarray]]) ->
     outer = np.zeros(sum(map(len, heads)), bool)
     outer[first[count == 1]] = True
     total = np.zeros(points.shape)
-    for facet, centre, mask in zip(facets, centres, np.split(outer, np.cumsum([len(h) for h in heads])[:-1])):
-        _add_normals(total, points, facet[mask], centre[mask])
+    for nodes, centre, mask in zip(facets, centres, np.split(outer, np.cumsum([len(h) for h in heads])[:-1])):
+        _add_normals(total, points, nodes[mask], centre[mask])
     length = np.linalg.norm(total, axis=1, keepdims=True)
     return np.where(length > 0, total / np.where(length > 0, length, 1.0), np.nan)
 

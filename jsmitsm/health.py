@@ -58,7 +58,7 @@ def repaired(
     neighbours from every direction.
     """
     shared = dz.shared_elimination(disc, nums)
-    points = np.asarray(disc.cloud.points)
+    points = disc.images.searched(np.asarray(disc.cloud.points))
     health = examine(classes, rows)
     new_classes, new_rows, touched = [], [], []
     for cls, row in zip(classes, rows):

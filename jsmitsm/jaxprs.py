@@ -152,6 +152,6 @@ def inlined(jaxpr: Any, consts: Sequence[Any], args: Sequence[Any]) -> list[Any]
         if inner is None:
             out = bind(eqn, *vals)
         else:
-            out = inlined(inner.jaxpr, inner.consts, vals[len(vals) - len(inner.jaxpr.invars):])
+            out = inlined(inner.jaxpr, inner.consts, vals[len(vals) - len(inner.jaxpr.invars) :])
         env.update(zip(eqn.outvars, out, strict=True))
     return [read(v) for v in jaxpr.outvars]

@@ -75,7 +75,7 @@ def _apply(ring: Ring, eqn: Any, vals: list[Any], linear: bool) -> list[Array]:
     inner = called(eqn)
     if inner is not None:
         # custom_vjp functions are expanded through their body: their rule knows only reverse mode.
-        return evaluate(inner.jaxpr, inner.consts, vals[len(vals) - len(inner.jaxpr.invars):], *ring)
+        return evaluate(inner.jaxpr, inner.consts, vals[len(vals) - len(inner.jaxpr.invars) :], *ring)
     active = [v for v in vals if v.shape[0] > 1]
     if not active:
         return [plain_elementwise(eqn, vals)] if name in ELEMENTWISE else _plain_any(eqn, vals)
@@ -127,7 +127,7 @@ def _by_derivative(ring: Ring, eqn: Any, vals: list[Array]) -> list[Array]:
     active = tuple(k for k, v in enumerate(vals) if v.shape[0] > 1)
     starts = _apply(Ring(ring.dim, 0), eqn, [v[:1] for v in vals], False)
     jaxpr, consts = derivative(eqn, active)
-    slopes_of = jaxpr.invars[len(vals):]
+    slopes_of = jaxpr.invars[len(vals) :]
     moving = set(slopes_of)
     still: list[tuple[Any, int]] = []
     going: list[tuple[Any, int]] = []
@@ -154,7 +154,12 @@ def _by_derivative(ring: Ring, eqn: Any, vals: list[Array]) -> list[Array]:
 
 
 def evaluate(
-    jaxpr: Any, consts: Sequence[Any], args: Sequence[Any], dim: int, degree: int, xp: Any = None,
+    jaxpr: Any,
+    consts: Sequence[Any],
+    args: Sequence[Any],
+    dim: int,
+    degree: int,
+    xp: Any = None,
     wanted: Sequence[int] | None = None,
 ) -> list[Any]:
     """Interpret a jaxpr on series.
@@ -218,17 +223,17 @@ def _promote(ring: Ring, vals: Sequence[Array], batch: int) -> list[Array]:
 def _scan(ring: Ring, eqn: Any, *vals: Array) -> list[Array]:
     p = eqn.params
     body, length = p["jaxpr"], p["length"]
-    fixed, carry = list(vals[: p["num_consts"]]), list(vals[p["num_consts"]:][: p["num_carry"]])
-    rows = vals[p["num_consts"] + p["num_carry"]:]
+    fixed, carry = list(vals[: p["num_consts"]]), list(vals[p["num_consts"] :][: p["num_carry"]])
+    rows = vals[p["num_consts"] + p["num_carry"] :]
     if on_host(*vals) or length * len(body.jaxpr.eqns) <= UNROLL:
         outs: list[list[Array]] = []
         for k in reversed(range(length)) if p["reverse"] else range(length):
             new = evaluate(body.jaxpr, body.consts, [*fixed, *carry, *(r[:, k] for r in rows)], *ring)
             carry = new[: p["num_carry"]]
-            outs.append(new[p["num_carry"]:])
+            outs.append(new[p["num_carry"] :])
         outs = outs[::-1] if p["reverse"] else outs
         stacked = []
-        for k, v in enumerate(eqn.outvars[p["num_carry"]:]):
+        for k, v in enumerate(eqn.outvars[p["num_carry"] :]):
             parts = unify(*(o[k] for o in outs)) if outs else [np.zeros((1, *v.aval.shape[1:], 1), v.aval.dtype)]
             stack = xp_of(*parts).stack(parts, 1)
             stacked.append(stack if outs else stack[:, :0])
@@ -237,7 +242,7 @@ def _scan(ring: Ring, eqn: Any, *vals: Array) -> list[Array]:
 
     def step(state: list[Array], row: list[Array]) -> tuple[list[Array], list[Array]]:
         new = evaluate(body.jaxpr, body.consts, [*fixed, *state, *row], *ring)
-        return _promote(ring, new[: p["num_carry"]], batch), _promote(ring, new[p["num_carry"]:], batch)
+        return _promote(ring, new[: p["num_carry"]], batch), _promote(ring, new[p["num_carry"] :], batch)
 
     moved = [jnp.moveaxis(jnp.asarray(r), 1, 0) for r in rows]
     carry, ys = jax.lax.scan(step, _promote(ring, carry, batch), moved, length, p["reverse"])
@@ -248,7 +253,7 @@ def _scan(ring: Ring, eqn: Any, *vals: Array) -> list[Array]:
 def _while(ring: Ring, eqn: Any, *vals: Array) -> list[Array]:
     p = eqn.params
     n, m = p["cond_nconsts"], p["body_nconsts"]
-    test_consts, body_consts, carry = list(vals[:n]), list(vals[n:n + m]), list(vals[n + m:])
+    test_consts, body_consts, carry = list(vals[:n]), list(vals[n : n + m]), list(vals[n + m :])
     test, body = p["cond_jaxpr"], p["body_jaxpr"]
 
     def goes_on(state: list[Array]) -> Array:
@@ -298,7 +303,5 @@ def _linear_solve(ring: Ring, eqn: Any, *vals: Array) -> list[Array]:
     """The solver itself, in series arithmetic: factors and substitutions have rules of their own."""
     lengths, solve = eqn.params["const_lengths"], eqn.params["jaxprs"].solve
     first = lengths.matvec + lengths.vecmat
-    consts, rhs = vals[first:first + lengths.solve], vals[sum(lengths):]
+    consts, rhs = vals[first : first + lengths.solve], vals[sum(lengths) :]
     return evaluate(solve.jaxpr, solve.consts, [*consts, *rhs], *ring)
-
-

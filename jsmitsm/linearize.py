@@ -83,7 +83,7 @@ def check_points(jaxpr: Any, kinds: Sequence[int]) -> list[int]:
         out = [DEPENDENT if eqn.primitive is field_p or any(kinds) else FREE] * len(eqn.outvars)
         inner = called(eqn)
         if inner is not None:
-            out = check_points(inner.jaxpr, kinds[len(kinds) - len(inner.jaxpr.invars):])
+            out = check_points(inner.jaxpr, kinds[len(kinds) - len(inner.jaxpr.invars) :])
         elif name == "custom_jvp_call":
             out = check_points(eqn.params["call_jaxpr"].jaxpr, kinds)
         elif name in _FORWARDING and kinds[0] == POINT:
@@ -110,8 +110,8 @@ def _check_control(eqn: Any, kinds: list[int]) -> None:
         check_points(p["jaxpr"].jaxpr, kinds[:n] + loose(kinds[n:]))
     elif name == "while":
         n, m = p["cond_nconsts"], p["body_nconsts"]
-        check_points(p["cond_jaxpr"].jaxpr, kinds[:n] + loose(kinds[n + m:]))
-        check_points(p["body_jaxpr"].jaxpr, kinds[n:n + m] + loose(kinds[n + m:]))
+        check_points(p["cond_jaxpr"].jaxpr, kinds[:n] + loose(kinds[n + m :]))
+        check_points(p["body_jaxpr"].jaxpr, kinds[n : n + m] + loose(kinds[n + m :]))
     elif name == "cond":
         for branch in p["branches"]:
             check_points(branch.jaxpr, kinds[1:])
@@ -142,7 +142,7 @@ def open_fields(jaxpr: Any, consts: Sequence[Any], args: Sequence[Any], slots: d
             elif eqn.primitive is frozen_p:
                 out = vals
             elif inner is not None:
-                out = walk(inner.jaxpr, inner.consts, vals[len(vals) - len(inner.jaxpr.invars):], share)
+                out = walk(inner.jaxpr, inner.consts, vals[len(vals) - len(inner.jaxpr.invars) :], share)
             elif any(slots_of(j) for j in inner_jaxprs(eqn)):
                 out = control(eqn, vals)
             else:
@@ -159,9 +159,7 @@ def open_fields(jaxpr: Any, consts: Sequence[Any], args: Sequence[Any], slots: d
         if name == "custom_jvp_call":
             return walk(p["call_jaxpr"].jaxpr, p["call_jaxpr"].consts, vals, False)
         if name == "cond":
-            branches = [
-                lambda operands, b=b: walk(b.jaxpr, b.consts, operands, False) for b in p["branches"]
-            ]
+            branches = [lambda operands, b=b: walk(b.jaxpr, b.consts, operands, False) for b in p["branches"]]
             return jax.lax.switch(vals[0], branches, vals[1:])
         if name == "scan":
             n, m = p["num_consts"], p["num_carry"]
@@ -171,7 +169,7 @@ def open_fields(jaxpr: Any, consts: Sequence[Any], args: Sequence[Any], slots: d
                 out = walk(body.jaxpr, body.consts, [*vals[:n], *carry, *row], False)
                 return out[:m], out[m:]
 
-            carry, ys = jax.lax.scan(step, vals[n:n + m], vals[n + m:], p["length"], p["reverse"])
+            carry, ys = jax.lax.scan(step, vals[n : n + m], vals[n + m :], p["length"], p["reverse"])
             return [*carry, *ys]
         n, m = p["cond_nconsts"], p["body_nconsts"]
         test, body = p["cond_jaxpr"], p["body_jaxpr"]
@@ -195,9 +193,9 @@ def _key(eqn: Any, vals: list[Any]) -> Any:
     return eqn.primitive, params, operands, tuple(v.aval.shape for v in eqn.outvars)
 
 
-def tangents_of(jaxpr: Any, consts: Sequence[Any], args: Sequence[Any], seeds: dict[int, Any]) -> tuple[
-    list[Any], list[dict[int, Any]]
-]:
+def tangents_of(
+    jaxpr: Any, consts: Sequence[Any], args: Sequence[Any], seeds: dict[int, Any]
+) -> tuple[list[Any], list[dict[int, Any]]]:
     """Results of a flat jaxpr and their derivatives with respect to some scalar inputs.
 
     ``seeds``: input position -> tangent.  The derivatives are dictionaries by input position: an
@@ -329,9 +327,9 @@ def record(
     ordered = tuple(sorted(slots, key=_grade))
     scalars = [jax.ShapeDtypeStruct((), dtype)] * len(ordered)
     rest, consts = [_shaped(v) for v in flat.invars[1:]], [_shaped(v) for v in flat.constvars]
-    second = jax.make_jaxpr(
-        lambda x, s, r, c: open_fields(flat, c, [x, *r], dict(zip(ordered, s, strict=True)))
-    )(point, scalars, rest, consts)
+    second = jax.make_jaxpr(lambda x, s, r, c: open_fields(flat, c, [x, *r], dict(zip(ordered, s, strict=True))))(
+        point, scalars, rest, consts
+    )
     outputs: list[int | None] = []
 
     def derivatives(*args: Any) -> list[Any]:
@@ -350,7 +348,7 @@ def record(
     n = len(flat.constvars)
     jaxpr: Any = third.jaxpr
     jaxpr = jaxpr.replace(
-        constvars=[*jaxpr.constvars, *jaxpr.invars[len(jaxpr.invars) - n:]],
+        constvars=[*jaxpr.constvars, *jaxpr.invars[len(jaxpr.invars) - n :]],
         invars=jaxpr.invars[: len(jaxpr.invars) - n],
     )
     return Record(jaxpr, (*third.consts, *first.consts), ordered, tuple(outputs), flat.outvars[0].aval.shape[0])

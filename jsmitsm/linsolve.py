@@ -122,9 +122,7 @@ def solve(
     return x.reshape(b.shape)
 
 
-def _check(
-    data: Any, rows: Any, cols: Any, b: Any, n: int, points: Any, solver: str
-) -> np.ndarray | None:
+def _check(data: Any, rows: Any, cols: Any, b: Any, n: int, points: Any, solver: str) -> np.ndarray | None:
     """Refuse what does not fit; the points as a numpy array."""
     if solver not in SOLVERS:
         raise ValueError(f"solver: got {solver!r}, expected one of {', '.join(SOLVERS)}")
@@ -134,13 +132,10 @@ def _check(
             f"{np.shape(data)}, {np.shape(rows)}, {np.shape(cols)}"
         )
     if np.ndim(b) not in (1, 2) or np.shape(b)[0] != n:
-        raise ValueError(
-            f"b: got shape {np.shape(b)}, expected ({n},) or ({n}, m) for n = {n} unknowns"
-        )
+        raise ValueError(f"b: got shape {np.shape(b)}, expected ({n},) or ({n}, m) for n = {n} unknowns")
     if jnp.issubdtype(jnp.result_type(data, b), jnp.complexfloating):
         raise ValueError(
-            "data, b: got complex numbers, expected real ones; solve for the real and imaginary "
-            "parts as two fields"
+            "data, b: got complex numbers, expected real ones; solve for the real and imaginary parts as two fields"
         )
     for name, index in (("rows", rows), ("cols", cols)):
         if not jnp.issubdtype(jnp.result_type(index), jnp.integer):
@@ -149,8 +144,7 @@ def _check(
             low, high = int(np.min(index)), int(np.max(index))
             if low < 0 or high >= n:
                 raise ValueError(
-                    f"{name}: got indices from {low} to {high}, expected 0 to {n - 1} "
-                    f"for n = {n} unknowns"
+                    f"{name}: got indices from {low} to {high}, expected 0 to {n - 1} for n = {n} unknowns"
                 )
     if points is None:
         return None
@@ -247,9 +241,7 @@ def _jvp(primals: Any, tangents: Any, *, settings: Settings, transpose: bool) ->
     return x, again(data, rows, cols, rhs)
 
 
-def _transpose(
-    ct: Any, data: Any, rows: Any, cols: Any, b: Any, *, settings: Settings, transpose: bool
-) -> Any:
+def _transpose(ct: Any, data: Any, rows: Any, cols: Any, b: Any, *, settings: Settings, transpose: bool) -> Any:
     """b_bar = A^-T x_bar."""
     if ad.is_undefined_primal(data):
         raise NotImplementedError("a solve is linear in its right-hand side only")
@@ -299,9 +291,7 @@ def _scatter(data: Any, rows: Any, cols: Any, x: Any) -> Any:
     return jnp.zeros_like(x).at[rows].add(data[:, None] * x[cols])
 
 
-def _lower(
-    ctx: Any, data: Any, rows: Any, cols: Any, b: Any, *, settings: Settings, transpose: bool
-) -> Any:
+def _lower(ctx: Any, data: Any, rows: Any, cols: Any, b: Any, *, settings: Settings, transpose: bool) -> Any:
     """Under jit: small systems in plain JAX, the others by a call back to the host.
 
     `pure_callback` hands JAX arrays to the host, and waiting for those hangs on a machine with one

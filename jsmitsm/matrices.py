@@ -38,10 +38,10 @@ def factor_lu(ring: Ring, a: Array) -> tuple[Array, Array, Array]:
         rows = xp.broadcast_to(swap[None, ..., None, :], (1, *a.shape[1:]))
         a = xp.take_along_axis(a, rows, axis=-3)
         if k + 1 < n:
-            factor = div(ring, a[..., k + 1:, k:k + 1, :], a[..., k:k + 1, k:k + 1, :])
-            rest = _sub(a[..., k + 1:, k + 1:, :], mul(ring, factor, a[..., k:k + 1, k + 1:, :]))
-            lower = _join([a[..., k + 1:, :k, :], factor, rest], -2)
-            a = _join([a[..., :k + 1, :, :], lower], -3)
+            factor = div(ring, a[..., k + 1 :, k : k + 1, :], a[..., k : k + 1, k : k + 1, :])
+            rest = _sub(a[..., k + 1 :, k + 1 :, :], mul(ring, factor, a[..., k : k + 1, k + 1 :, :]))
+            lower = _join([a[..., k + 1 :, :k, :], factor, rest], -2)
+            a = _join([a[..., : k + 1, :, :], lower], -3)
     return a, xp.stack(pivots, -2), permutation
 
 
@@ -60,7 +60,7 @@ def _permutation(ring: Ring, eqn: Any, pivots: Array) -> Array:
     column = np.arange(n).reshape(n, 1)
     out = xp.broadcast_to(column, (*pivots.shape[1:-2], n, pivots.shape[-1]))
     for k in range(pivots.shape[-2]):
-        best = pivots[0, ..., k:k + 1, :]
+        best = pivots[0, ..., k : k + 1, :]
         out = xp.take_along_axis(out, xp.where(column == k, best, xp.where(column == best, k, column)), axis=-2)
     return out[None].astype(np.int32)
 
@@ -72,7 +72,7 @@ def _cholesky(ring: Ring, eqn: Any, a: Array) -> Array:
     for j in range(n):
         v = a[..., j:, j, :]
         for c in columns:
-            v = _sub(v, mul(ring, c[..., j:, :], c[..., j:j + 1, :]))
+            v = _sub(v, mul(ring, c[..., j:, :], c[..., j : j + 1, :]))
         pivot = v[..., :1, :]
         start = xp_of(v).sqrt(pivot[:1])
         half = np.full((1,) * v.ndim, 0.5, v.dtype)
@@ -102,5 +102,3 @@ def _triangular_solve(ring: Ring, eqn: Any, a: Array, b: Array) -> Array:
     parts = unify(*(rows[i] for i in range(n)))
     out = xp_of(*parts).stack(parts, -3)
     return out if p["left_side"] else out.swapaxes(-3, -2)
-
-

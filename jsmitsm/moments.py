@@ -207,9 +207,7 @@ def local_system(
         basis = basis @ z
         tests = None if tests is None else tests @ z
     phi = values @ basis
-    return System(
-        solution, basis, own_rows, own_scale, own_solve, values, phi, weights, tests, data_scale
-    )
+    return System(solution, basis, own_rows, own_scale, own_solve, values, phi, weights, tests, data_scale)
 
 
 def functional(scheme: Scheme, near: Support, system: System, wanted: Any) -> tuple[Any, Any, Any, Any]:
@@ -280,9 +278,7 @@ class Block(NamedTuple):
     load: Any
 
 
-def block(
-    scheme: Scheme, near: Support, solution: Elimination, own: Any, data: Any, source: Any, given: Any
-) -> Block:
+def block(scheme: Scheme, near: Support, solution: Elimination, own: Any, data: Any, source: Any, given: Any) -> Block:
     """The least-squares misfit of the particle's local fit as a quadratic form of its data."""
     system = local_system(scheme, near, solution, own, data, None, skip_self=False)
     part = particular_part(scheme, solution, system, source, given)

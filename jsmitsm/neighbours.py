@@ -62,7 +62,9 @@ def stencils(cloud: Cloud, *, size: int | None = None, radius: Any = None) -> St
     Stencils(81 particles, at most 9 neighbours each, themselves counted)
     """
     if not isinstance(cloud, Cloud):
-        raise ValueError(f"cloud: expected a js.Cloud, got {type(cloud).__name__}; build one with js.Cloud(points, groups)")
+        raise ValueError(
+            f"cloud: expected a js.Cloud, got {type(cloud).__name__}; build one with js.Cloud(points, groups)"
+        )
     if isinstance(cloud.points, jax.core.Tracer):
         raise ValueError(
             "cloud: its points are traced by a JAX transform, and neighbours are found on the host; "
@@ -83,8 +85,7 @@ def nearest(points: np.ndarray, size: int, which: np.ndarray | None = None) -> S
     n = len(points)
     if n < size:
         raise ValueError(
-            f"size: {size} neighbours asked for, but the cloud has only {n} particles; "
-            "lower the order or add particles"
+            f"size: {size} neighbours asked for, but the cloud has only {n} particles; lower the order or add particles"
         )
     centres = points if which is None else points[which]
     from scipy.spatial import cKDTree

@@ -13,9 +13,7 @@ import numpy as np
 LEAF = 30  # unknowns of a region that is not cut further; 15 to 60 give the same fill-in
 
 
-def nested_dissection(
-    rows: np.ndarray, cols: np.ndarray, points: np.ndarray, leaf: int = LEAF
-) -> np.ndarray:
+def nested_dissection(rows: np.ndarray, cols: np.ndarray, points: np.ndarray, leaf: int = LEAF) -> np.ndarray:
     """Nested-dissection order of the unknowns of a sparse matrix.
 
     Args:
@@ -93,9 +91,7 @@ def _halve(points: np.ndarray, leaf: int) -> tuple[np.ndarray, int, np.ndarray]:
     return code, depth, orders[0]
 
 
-def _separator_levels(
-    rows: np.ndarray, cols: np.ndarray, code: np.ndarray, depth: int
-) -> np.ndarray:
+def _separator_levels(rows: np.ndarray, cols: np.ndarray, code: np.ndarray, depth: int) -> np.ndarray:
     """Level (0: the first cut) of the separator every unknown belongs to; `depth` for none."""
     a, b = code[rows], code[cols]
     differ = a ^ b

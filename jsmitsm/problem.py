@@ -237,7 +237,9 @@ def _check_params(params: Any) -> None:
             continue
         where = f"params{jax.tree_util.keystr(path)}"
         if getattr(leaf, "dtype", np.asarray(leaf).dtype if np.isscalar(leaf) else np.dtype(object)).kind not in "biuf":
-            raise ValueError(f"{where}: expected a real number or array, got {leaf!r}; let the pde close over it instead")
+            raise ValueError(
+                f"{where}: expected a real number or array, got {leaf!r}; let the pde close over it instead"
+            )
         if not np.isfinite(np.asarray(leaf)).all():
             raise ValueError(f"{where}: NaN or infinite numbers; give finite ones")
 

@@ -94,9 +94,7 @@ def recursion(
             if any(g == f and pattern[e, s] for s, (g, _) in enumerate(slots))
         ]
         weights[f] = min(gaps, default=0)
-    levels = [
-        max(sum(b) + weights[f] for s, (f, b) in enumerate(slots) if pattern[e, s]) for e in range(len(orders))
-    ]
+    levels = [max(sum(b) + weights[f] for s, (f, b) in enumerate(slots) if pattern[e, s]) for e in range(len(orders))]
     return Recursion(
         dim, order, fields, tuple(slots), tuple(levels), tuple(weights),
         tuple(order - m for m in orders), tuple(tuple(bool(v) for v in row) for row in pattern),

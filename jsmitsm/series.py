@@ -108,7 +108,7 @@ def mul(ring: Ring, x: Array, y: Array) -> Array:
 
 def block(ring: Ring, x: Array, degree: int) -> Array:
     """The coefficients of exactly this degree."""
-    return x[count(ring.dim, degree - 1): count(ring.dim, degree)]
+    return x[count(ring.dim, degree - 1) : count(ring.dim, degree)]
 
 
 def product_block(ring: Ring, x: Array, y: Array, degree: int, first: int = 1, weighted: bool = False) -> Array:

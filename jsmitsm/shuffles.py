@@ -114,7 +114,7 @@ def _pad(ring: Ring, eqn: Any, x: Array, value: Array) -> Array:
 
 
 def _strides(shape: tuple[int, ...]) -> list[int]:
-    return [math.prod(shape[k + 1:]) for k in range(len(shape))]
+    return [math.prod(shape[k + 1 :]) for k in range(len(shape))]
 
 
 def _along(values: Array, axis: int, rank: int) -> Array:
@@ -149,8 +149,16 @@ def _dynamic_update_slice(ring: Ring, eqn: Any, x: Array, update: Array, *starts
 
 
 def _gather_places(
-    shape: tuple[int, ...], out_rank: int, indices: Array, offset_dims: Any, collapsed: Any, index_map: Any,
-    batching: Any, index_batching: Any, sizes: Any, clip: bool,
+    shape: tuple[int, ...],
+    out_rank: int,
+    indices: Array,
+    offset_dims: Any,
+    collapsed: Any,
+    index_map: Any,
+    batching: Any,
+    index_batching: Any,
+    sizes: Any,
+    clip: bool,
 ) -> tuple[Array, Array]:
     """Flat source places (*out, B) of a gather, and which of them lie inside the operand."""
     indices = indices[0]  # (*batch, K, B)
@@ -272,7 +280,7 @@ def _flattened(x: Array, axes: tuple[int, ...]) -> Array:
     """The given axes as one, in place 1."""
     xp = xp_of(x)
     x = xp.moveaxis(x, axes, range(1, len(axes) + 1))
-    return x.reshape(x.shape[0], -1, *x.shape[len(axes) + 1:])
+    return x.reshape(x.shape[0], -1, *x.shape[len(axes) + 1 :])
 
 
 @rule("reduce_max", "reduce_min")

@@ -26,8 +26,7 @@ def null_space(matrix: Any) -> tuple[Any, Any]:
         x, q = carry
         column = jnp.where(jnp.arange(k) >= j, x[:, j], 0.0)
         length = jnp.sqrt(jnp.sum(column**2))
-        pivot = column[j]
-        v = column.at[j].add(jnp.where(pivot >= 0, length, -length))
+        v = column + jnp.where(jnp.arange(k) == j, jnp.where(column[j] >= 0, length, -length), 0.0)
         beta = jnp.sum(v**2)
         v = v * jnp.sqrt(2.0 / jnp.where(beta > 0, beta, 1.0))
         return x - jnp.outer(v, v @ x), q - jnp.outer(q @ v, v)
@@ -51,10 +50,11 @@ def _inverse_lower(lower: Any) -> Any:
     n = lower.shape[0]
 
     def step(i, inverse):
+        at = jnp.arange(n) == i
         row = jnp.where(jnp.arange(n) < i, lower[i], 0.0)
         pivot = lower[i, i]
         safe = jnp.where(jnp.abs(pivot) > 1e-13, pivot, jnp.inf)
-        return inverse.at[i].set((jnp.eye(n, dtype=lower.dtype)[i] - row @ inverse) / safe)
+        return jnp.where(at[:, None], (at - row @ inverse) / safe, inverse)
 
     return jax.lax.fori_loop(0, n, step, jnp.zeros_like(lower))
 
@@ -67,11 +67,12 @@ def general_inverse(matrix: Any) -> Any:
 
     def step(k, work):
         pivot = jnp.argmax(jnp.where(jnp.arange(n) >= k, jnp.abs(work[:, k]), -1.0))
+        here, there = jnp.arange(n) == k, jnp.arange(n) == pivot
         row, other = work[pivot], work[k]
-        work = work.at[pivot].set(other)
+        work = jnp.where(there[:, None], other, work)
         row = row / row[k]
-        column = work[:, k].at[k].set(0.0)
-        return (work - jnp.outer(column, row)).at[k].set(row)
+        column = jnp.where(here, 0.0, work[:, k])
+        return jnp.where(here[:, None], row, work - jnp.outer(column, row))
 
     return jax.lax.fori_loop(0, n, step, work)[:, n:]
 
@@ -91,11 +92,12 @@ def gram_inverse(a: Any, tolerance: float | None = None) -> Any:
     k = gram.shape[0]
 
     def sweep(g, j, keep):
+        # With v = g[j] - e_j one rank-one update does the whole sweep but for 2 on the diagonal.
+        at = jnp.arange(k) == j
         row = g[j]
         pivot = jnp.where(keep, row[j], 1.0)
-        swept = g - jnp.outer(row, row / pivot)
-        swept = swept.at[j].set(row / pivot).at[:, j].set(row / pivot).at[j, j].set(-1.0 / pivot)
-        return jnp.where(keep, swept, g)
+        v = row - at
+        return jnp.where(keep, g - jnp.outer(v, v / pivot) - 2.0 * jnp.outer(at, at), g)
 
     if tolerance is None:
         inverse = -jax.lax.fori_loop(0, k, lambda j, g: sweep(g, j, True), gram)

@@ -11,12 +11,12 @@ import numpy as np
 from jsmitsm import discretize as dz
 from jsmitsm.clouds import Cloud
 from jsmitsm.discretize import Discretization
-from jsmitsm.system import Run
 from jsmitsm.kernels import Kernel
 from jsmitsm.neighbours import Stencils
 from jsmitsm.newton import newton
 from jsmitsm.problem import Problem
 from jsmitsm.solution import Recipe, Solution
+from jsmitsm.system import Run
 
 METHODS = ("I", "II", "III", "S", "SSPH")
 SOLVERS = ("auto", "dense", "sparse", "iterative")
@@ -42,7 +42,9 @@ class Fit:
     def coefficients(self, values: Any) -> Any:
         """Taylor coefficients (N, F, K) of every particle."""
         disc = self.discretization()
-        disc.classes = dz.sorted_classes(disc, np.arange(len(self.cloud)), disc.stencils)
+        disc.classes = dz.sorted_classes(
+            disc, np.flatnonzero(disc.partner == np.arange(len(self.cloud))), disc.stencils
+        )
         nums = dz.numbers(disc, self.problem, self.taylor, everywhere=True)
         return dz.all_coefficients(disc, nums, values)
 
@@ -151,5 +153,7 @@ def _check(problem, cloud, method, order, kernel, stencils, formulation, solver)
     ):  # fmt: skip
         if value not in known:
             raise ValueError(f"{name}: {value!r} is none of {', '.join(map(repr, known))}")
+    if stencils is not None and any(c.kind == "periodic" for cs in problem.bcs.values() for c in cs):
+        raise ValueError("stencils: those of a cloud do not reach periodic images; leave stencils out")
     if isinstance(order, bool) or not isinstance(order, (int, np.integer)) or not 1 <= order <= 14:
         raise ValueError(f"order: expected a whole number from 1 to 14, the degree of the expansions, got {order!r}")

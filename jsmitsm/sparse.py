@@ -229,9 +229,7 @@ class Factor:
                 break
         return x, error if np.isfinite(error) else np.inf
 
-    def _backward_error(
-        self, residual: np.ndarray, x: np.ndarray, b: np.ndarray, transpose: bool
-    ) -> float:
+    def _backward_error(self, residual: np.ndarray, x: np.ndarray, b: np.ndarray, transpose: bool) -> float:
         """Largest over the columns of |r| / (|A| |x| + |b|), maximum norms."""
         if not residual.size:
             return 0.0
@@ -248,9 +246,7 @@ class Factor:
         except (RuntimeError, ValueError, np.linalg.LinAlgError) as error:
             if self._give_way(f"failed ({error})"):
                 return
-            raise SingularMatrix(
-                f"the matrix is singular ({backend}: {error})", self._dependent_unknowns()
-            ) from error
+            raise SingularMatrix(f"the matrix is singular ({backend}: {error})", self._dependent_unknowns()) from error
         self.info.update(backend=backend, factor_entries=self._lu.entries)
         self.info["seconds"]["factorisation"] += time.perf_counter() - started
         self._refuse_singular()
@@ -304,9 +300,7 @@ class Factor:
         return (index if self.order is None else self.order[index]).tolist()
 
 
-def choose_backends(
-    n: int, nnz: int, points: np.ndarray | None, solver: str, elliptic: bool
-) -> list[str]:
+def choose_backends(n: int, nnz: int, points: np.ndarray | None, solver: str, elliptic: bool) -> list[str]:
     """Backends to be tried in turn."""
     if solver == "dense" or (solver == "auto" and n <= DENSE_MAX):
         return ["lapack"]

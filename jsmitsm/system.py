@@ -23,7 +23,9 @@ COMPATIBLE = 1e-6
 class Run:
     """One call of ``solve``: the discretisation, its options, and what happened."""
 
-    def __init__(self, disc: Discretization, problem: Problem, solver: str, throw: bool, repair: bool, formulation: str):
+    def __init__(
+        self, disc: Discretization, problem: Problem, solver: str, throw: bool, repair: bool, formulation: str
+    ):
         self.disc, self.problem = disc, problem
         self.solver, self.throw, self.repair = solver, throw, repair
         self.formulation = formulation

@@ -89,14 +89,14 @@ class Traced:
         n = np.shape(points)[0]
         if len(extras) != self._n_extras:
             raise ValueError(f"extras must be {self._n_extras} arrays, as declared to trace, got {len(extras)}")
-        rest = [v.aval for v in self._record.jaxpr.invars[1 + len(self._record.slots):]]
+        rest = [v.aval for v in self._record.jaxpr.invars[1 + len(self._record.slots) :]]
         for k, (value, aval) in enumerate(zip(extras, rest, strict=False)):
             if np.shape(value) != (n, *aval.shape):
                 raise ValueError(f"extras[{k}] must have shape {(n, *aval.shape)}, got {np.shape(value)}")
         leaves, tree = jax.tree.flatten(params)
         if tree != self._params_tree:
             raise ValueError(f"params must have the structure that was traced, {self._params_tree}, got {tree}")
-        for leaf, aval in zip(leaves, rest[self._n_extras:], strict=True):
+        for leaf, aval in zip(leaves, rest[self._n_extras :], strict=True):
             if np.shape(leaf) != aval.shape:
                 raise ValueError(f"a leaf of params has shape {np.shape(leaf)}, but {aval.shape} was traced")
         expected = (len(self.slots), count(self.dim, degree), n)
@@ -159,7 +159,7 @@ class Traced:
         last = [jnp.moveaxis(e, 0, -1) if isinstance(e, jax.Array) else np.moveaxis(e, 0, -1) for e in inputs.extras]
         params = [
             plain(v).astype(a.aval.dtype)
-            for v, a in zip(inputs.leaves, r.jaxpr.invars[1 + len(fields) + len(last):], strict=True)
+            for v, a in zip(inputs.leaves, r.jaxpr.invars[1 + len(fields) + len(last) :], strict=True)
         ]
         args = [variable(inputs.points.astype(dtype), degree), *fields, *(e[None].astype(dtype) for e in last), *params]
         out = evaluate(r.jaxpr, inputs.consts, args, self.dim, degree, None, self._wanted(jac, res))

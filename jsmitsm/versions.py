@@ -27,7 +27,7 @@ def show_versions(file: Any = None) -> None:
     lines += [("cores", str(os.cpu_count()))]
     lines += [(name, _version(name)) for name in _NEEDED + _EXTRAS]
     lines += [("devices", ", ".join(map(str, jax.devices())))]
-    lines += [("float64", "on" if jax.config.jax_enable_x64 else "off (jax_enable_x64)")]
+    lines += [("float64", "on" if jax.config.read("jax_enable_x64") else "off (jax_enable_x64)")]
     print("\n".join(f"{name:12} {value}" for name, value in lines), file=file)
 
 

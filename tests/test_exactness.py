@@ -7,7 +7,6 @@ at most about 1e4 and a global one of about 1e2.
 """
 
 import manufactured as mm
-import numpy as np
 import pytest
 
 import jsmitsm as js
@@ -27,10 +26,16 @@ def solve(method, dim, operator, kind, order=None):
     return js.solve(problem, cloud, method=method, order=order, kernel=mm.lattice_kernel(dim, n, reach)), exact
 
 
-@pytest.mark.parametrize("kind", ["dirichlet", "mixed"])
-@pytest.mark.parametrize("operator", [mm.laplace, mm.variable], ids=["constant", "variable"])
-@pytest.mark.parametrize("dim", [1, 2, 3])
-@pytest.mark.parametrize("method", mm.METHODS)
+EASY, HARD, CROSSED = (mm.laplace, "dirichlet"), (mm.variable, "mixed"), (mm.laplace, "mixed")
+# Every method meets both ends of the table in every dimension; the mixed middle only where it is cheap.
+TABLE = [
+    *((method, dim, *pair) for method in mm.METHODS for dim in CASES for pair in (EASY, HARD)),
+    *((method, 1, *CROSSED) for method in mm.METHODS),
+    ("S", 2, *CROSSED),
+]
+
+
+@pytest.mark.parametrize("method, dim, operator, kind", TABLE)
 def test_polynomials_are_reproduced(method, dim, operator, kind):
     sol, exact = solve(method, dim, operator, kind)
     assert sol.converged

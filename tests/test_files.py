@@ -66,14 +66,15 @@ def test_a_pyramid_has_its_five_faces():
 
 def test_gmsh_file_with_physical_names(tmp_path):
     """A Gmsh file: an orphan node, named sides, a tag within the domain that is no boundary."""
-    points = [[9, 9, 0], [0, 0, 0], [1, 0, 0], [2, 0, 0], [0, 1, 0], [1, 1, 0], [2, 1, 0], [0, 2, 0], [1, 2, 0], [2, 2, 0]]
+    points = [[9, 9, 0], *([x, y, 0] for y in range(3) for x in range(3))]
     quads = [[1, 2, 5, 4], [2, 3, 6, 5], [4, 5, 8, 7], [5, 6, 9, 8]]
     lines = [[1, 2], [2, 3], [3, 6], [6, 9], [4, 5]]
     mesh = meshio.Mesh(
         points,
         [("quad", quads), ("line", lines)],
         cell_data={"gmsh:physical": [[5] * 4, [2, 2, 8, 8, 3]], "gmsh:geometrical": [[1] * 4, [1, 1, 2, 2, 3]]},
-        field_data={"right": np.array([8, 1]), "bottom": np.array([2, 1]), "inner": np.array([3, 1]), "all": np.array([5, 2])},
+        field_data={k: np.array(v) for k, v in
+                    {"right": [8, 1], "bottom": [2, 1], "inner": [3, 1], "all": [5, 2]}.items()},
     )  # fmt: skip
     mesh.write(tmp_path / "square.msh", file_format="gmsh22", binary=False)
     cloud = from_mesh(tmp_path / "square.msh")
@@ -107,7 +108,8 @@ def test_cell_sets_point_sets_and_a_chosen_tag():
 
 def test_a_problem_on_a_mesh_file_is_solved_and_written_back(tmp_path):
     """u = x^2 + y is a polynomial: exact on the nodes of any mesh; VTU brings it back to the last bit."""
-    cloud = from_polygon([(0, 0), (2, 0), (2, 1), (0, 1)], 0.2, holes=[[(0.8, 0.4), (1.2, 0.4), (1.2, 0.6), (0.8, 0.6)]])
+    hole = [(0.8, 0.4), (1.2, 0.4), (1.2, 0.6), (0.8, 0.6)]
+    cloud = from_polygon([(0, 0), (2, 0), (2, 1), (0, 1)], 0.2, holes=[hole])
     mesh = meshio.Mesh(np.pad(cloud.points, ((0, 0), (0, 1))), [("triangle", simplices(cloud))])
     mesh.write(tmp_path / "plate.vtk")
     cloud = from_mesh(tmp_path / "plate.vtk")

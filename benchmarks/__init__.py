@@ -1,0 +1,1 @@
+"""Scripts that print the tables and draw the pictures of the documentation: ``python -m benchmarks.NAME``."""

@@ -1,0 +1,167 @@
+"""The global system: coordinates of its matrix, its right-hand side, and its two forms."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from jsmitsm import assembly
+from jsmitsm.boundary import is_traced
+from jsmitsm.layout import Class, Discretization, sorted_classes, table
+from jsmitsm.moments import Row
+from jsmitsm.neighbours import Stencils
+from jsmitsm.numbers import Numbers
+from jsmitsm.rows import operands, right_sides, shared_elimination
+
+
+def matrix(disc: Discretization, classes: list[Class], rows: list[Row]) -> tuple[Any, Any, Any]:
+    """The global matrix as coordinates: own u_i - sum_g weights u_g over the unknowns."""
+    unknown, fields = disc.unknowns, disc.rec.fields
+    parts = []
+    for cls, row in zip(classes, rows):
+        near, xp = disc.images.owners(cls.neighbours), np
+        if is_traced(near):
+            xp = jnp
+        number = xp.asarray(unknown)
+        own = unknown[cls.ids]
+        col = xp.where((near >= 0)[..., None], number[near], -1)  # (n, w, F)
+        shape = (len(cls.ids), fields, near.shape[1], fields)
+        r = np.broadcast_to(own[:, :, None, None], shape)
+        c = xp.broadcast_to(col[:, None], shape)
+        keep = (r >= 0) & (c >= 0)
+        if is_traced(near):
+            parts.append(
+                (
+                    jnp.where(keep, -row.weights, 0.0).ravel(),
+                    jnp.where(keep, r, 0).ravel(),
+                    jnp.where(keep, c, 0).ravel(),
+                )
+            )
+        else:
+            place = np.flatnonzero(keep)
+            weights = row.weights.reshape(-1) if is_traced(row.weights) else np.asarray(row.weights).reshape(-1)
+            parts.append((-weights[place], r.reshape(-1)[place], c.reshape(-1)[place]))
+    n = int(unknown.max(initial=-1)) + 1
+    if disc.scheme.method != "SSPH":
+        parts.append((np.ones(n), np.arange(n), np.arange(n)))
+    traced = is_traced(parts)
+    join = jnp.concatenate if traced else np.concatenate
+    data, r, c = zip(*parts)
+    return join(data), (jnp if is_traced(r) else np).concatenate(r), (jnp if is_traced(c) else np).concatenate(c)
+
+
+def right_side(disc: Discretization, nums: Numbers, classes: list[Class], rows: list[Row]) -> Any:
+    """The global right-hand side (n,): source, own conditions and held neighbours."""
+    unknown = disc.unknowns
+    parts, places = [], []
+    for cls, row in zip(classes, rows):
+        xp = jnp if is_traced(nums, row, cls.neighbours) else np
+        source, given = right_sides(disc, nums, cls)
+        w, v, v_own = (xp.asarray(x) for x in (row.weights, row.source, row.condition))
+        index = xp.maximum(disc.images.owners(cls.neighbours), 0)
+        total = xp.einsum("nfr,nr->nf", v, source) + xp.einsum("nfk,nk->nf", v_own, given) + row.constant
+        total = total + xp.einsum("nfgh,ngh->nf", w, xp.asarray(nums.held)[index])
+        if disc.scheme.n_data:
+            total = total + xp.einsum("nfgd,ngd->nf", xp.asarray(row.data), xp.asarray(nums.gamma)[index])
+        own = unknown[cls.ids]
+        parts.append(total.reshape(-1)[np.flatnonzero(own >= 0)])
+        places.append(own[own >= 0])
+    xp = jnp if is_traced(parts) else np
+    order = np.argsort(np.concatenate(places)) if places else np.zeros(0, int)
+    return xp.concatenate(parts)[order] if parts else np.zeros(0)
+
+
+def least_squares(disc: Discretization, nums: Numbers) -> tuple[Any, Any, Any, Any]:
+    """The normal equations of the least-squares form, as coordinates, and their right-hand side.
+
+    Every particle contributes the misfit of its local fit, those with held values too: the
+    projector of a fit is idempotent, so nothing is squared.
+    """
+    shared = shared_elimination(disc, nums)
+    unknown, fields = disc.unknowns, disc.rec.fields
+    held = nums.held
+    n = int(unknown.max(initial=-1)) + 1
+    parts, b = [], np.zeros(n)
+    for cls in sorted_classes(disc, nums.ids, Stencils(table(disc), None)):
+        given = operands(disc, nums, cls.ids, cls.scheme, shared)
+        made = assembly.blocks(
+            cls.scheme, disc.points, disc.kernel, cls.ids, cls.neighbours, given, right_sides(disc, nums, cls)
+        )
+        near = disc.images.owners(cls.neighbours)
+        xp = jnp if is_traced(near, made, held, nums.gamma) else np
+        index = xp.maximum(near, 0)
+        place = xp.where((near >= 0)[..., None], xp.asarray(unknown)[index], -1).reshape(len(cls.ids), -1)
+        known = xp.where((near >= 0)[..., None], xp.asarray(held)[index], 0.0).reshape(len(cls.ids), -1)
+        known = xp.where(place >= 0, 0.0, known)
+        extra = xp.asarray(nums.gamma)[index].reshape(len(cls.ids), -1)
+        given_data = xp.concatenate([known, extra], axis=1)
+        m = place.shape[1]
+        matrix, load = xp.asarray(made.matrix), xp.asarray(made.load)
+        right = (load - xp.einsum("nij,nj->ni", matrix, given_data))[:, :m]
+        r = xp.broadcast_to(place[:, :, None], (len(cls.ids), m, m))
+        c = xp.broadcast_to(place[:, None, :], (len(cls.ids), m, m))
+        keep = (r >= 0) & (c >= 0)
+        if xp is np:
+            np.add.at(b, place[place >= 0], right[place >= 0])
+            parts.append((matrix[:, :m, :m][keep], r[keep], c[keep]))
+        else:
+            b = jnp.asarray(b).at[jnp.maximum(place, 0)].add(jnp.where(place >= 0, right, 0.0))
+            if is_traced(near):
+                flat = (jnp.where(keep, matrix[:, :m, :m], 0.0), jnp.where(keep, r, 0), jnp.where(keep, c, 0))
+                parts.append(tuple(x.reshape(-1) for x in flat))
+            else:
+                at = np.nonzero(np.asarray(keep))
+                parts.append((matrix[:, :m, :m][at], np.asarray(r)[at], np.asarray(c)[at]))
+    data, r, c = zip(*parts)
+    xp = jnp if is_traced(parts) else np
+    return (
+        xp.concatenate(data),
+        (jnp if is_traced(r) else np).concatenate(r),
+        (jnp if is_traced(c) else np).concatenate(c),
+        b,
+    )
+
+
+def prefers_least_squares(disc: Discretization, nums: Numbers) -> bool:
+    """Whether information travels: operators of first order, hyperbolic ones of second, and those
+    whose convection outweighs diffusion between neighbours (cell Peclet number above 2).
+
+    There a value predicted by neighbours on all sides is the wrong global form.
+    """
+    rec = disc.rec
+    orders = {rec.order - q for q in rec.degrees}
+    if disc.scheme.method != "S" or rec.fields > 1 or is_traced(nums.jac):
+        return False
+    if orders == {1}:
+        return True
+    if orders != {2}:
+        return False
+    symbol = np.zeros((nums.jac.shape[-1], rec.dim, rec.dim))
+    for s, (_, b) in enumerate(rec.slots):
+        if sum(b) == 2:
+            i, j = [axis for axis in range(rec.dim) for _ in range(b[axis])]
+            symbol[:, i, j] += nums.jac[0, s, 0] / 2
+            symbol[:, j, i] += nums.jac[0, s, 0] / 2
+    values = np.linalg.eigvalsh(symbol)
+    diffusion = np.abs(values).max(axis=1)
+    if (values[:, 0] * values[:, -1] < -1e-10 * diffusion**2).any():
+        return True
+    drift = [s for s, (_, b) in enumerate(rec.slots) if sum(b) == 1]
+    if not drift or is_traced(disc.cloud.points):
+        return False
+    speed = np.linalg.norm(nums.jac[0, drift, 0], axis=0)
+    points = np.asarray(disc.cloud.points)
+    apart = (np.prod(np.ptp(points, axis=0)) / len(points)) ** (1.0 / rec.dim)
+    return bool(np.median(speed * apart / diffusion) > 2.0)
+
+
+def with_held(disc: Discretization, nums: Numbers, x: Any) -> Any:
+    """All values (N, F) from the unknowns x (n,)."""
+    place = np.flatnonzero(~disc.held.reshape(-1))
+    if is_traced(x, nums.held):
+        return jnp.asarray(nums.held).reshape(-1).at[place].set(x).reshape(disc.held.shape)[disc.partner]
+    values = np.array(nums.held).reshape(-1)
+    values[place] = x
+    return values.reshape(disc.held.shape)[disc.partner]

@@ -1,0 +1,254 @@
+"""From a problem and a cloud to numbers: classes of particles, their operands, the global system."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from jsmitsm.boundary import Group, group_conditions, is_traced
+from jsmitsm.clouds import Cloud
+from jsmitsm.kernels import Gaussian, Kernel
+from jsmitsm.moments import Scheme
+from jsmitsm.neighbours import Stencils, nearest, within
+from jsmitsm.periodic import Images, periodic_images
+from jsmitsm.problem import Problem
+from jsmitsm.recursion import Recursion, free_indices, recursion
+from jsmitsm.trace import Traced, trace
+
+METHODS = ("I", "II", "III", "S", "SSPH")
+
+
+@dataclass
+class Class:
+    """Particles whose moment systems have the same shape.
+
+    ids (n,) ascending, neighbours (n, w), the particle itself first and -1 for none.
+    """
+
+    ids: np.ndarray
+    neighbours: Any
+    scheme: Scheme
+
+
+@dataclass
+class Discretization:
+    """What is static about a problem on a cloud: decided once, on the host."""
+
+    cloud: Cloud
+    kernel: Kernel | None
+    stencils: Stencils
+    traced: Traced
+    rec: Recursion
+    groups: list[Group]
+    scheme: Scheme  # of interior particles
+    classes: list[Class]
+    held: np.ndarray  # (N, F) bool, values given or taken from a periodic partner
+    partner: np.ndarray  # (N,) the particle whose value each one has: itself but for periodic images
+    images: Images
+    n_own: np.ndarray  # (N,) own conditions of each particle
+    given_stencils: bool  # the user's: nothing outside them is looked at
+
+    @property
+    def points(self) -> Any:
+        """The particles (N, D), followed by their periodic images."""
+        return self.images.extend(self.cloud.points)
+
+    @property
+    def linear(self) -> bool:
+        return self.traced.linear and all(g.linear for g in self.groups)
+
+    @property
+    def floating(self) -> tuple[int, ...]:
+        """Fields that the problem determines only up to a constant: no value of theirs enters."""
+        zero = (0,) * self.rec.dim
+        values = {f for f, b in (*self.rec.slots, *self.scheme.own) if b == zero}
+        return tuple(f for f in range(self.rec.fields) if f not in values) if self.linear else ()
+
+    @property
+    def active(self) -> np.ndarray:
+        """The particles that carry equations, ascending."""
+        return np.flatnonzero(~self.held.all(axis=1))
+
+    @property
+    def unknowns(self) -> np.ndarray:
+        """The number of each unknown among all values, (N, F); -1 for held ones."""
+        number = np.full(self.held.size, -1)
+        free = ~self.held.reshape(-1)
+        number[free] = np.arange(free.sum())
+        return number.reshape(self.held.shape)[self.partner]
+
+
+def discretize(
+    problem: Problem, cloud: Cloud, method: str, order: int, kernel: Kernel | None,
+    stencils: Stencils | None, basis_terms: int | None,
+) -> Discretization:  # fmt: skip
+    """Trace the problem, lay out its recursion and conditions, and find neighbours."""
+    traced = trace(problem.pde, cloud.dim, problem.fields, params=problem.params)
+    _check_operator(traced, problem, order)
+    rec = recursion(cloud.dim, order, problem.fields, traced.slots, traced.pattern, traced.order)
+    groups = group_conditions(problem, cloud, order, max(traced.order))
+    held = np.zeros((len(cloud), problem.fields), bool)
+    for group in groups:
+        for k in group.held:
+            held[group.ids, k] = True
+    images, partner = periodic_images(problem, cloud)
+    held[partner != np.arange(len(cloud))] = True
+    n_own = np.zeros(len(cloud), int)
+    for group in groups:
+        n_own[group.ids] = group.n_rows + len(group.held)
+    scheme = _scheme(method, rec, traced, problem, cloud, basis_terms)
+    scheme = replace(scheme, **_conditions_layout(groups, rec))
+    if len(images.owner) and method in ("I", "II"):
+        raise ValueError(f"method: {method} does not follow periodic conditions; use S, III or SSPH")
+    given_stencils = stencils is not None
+    if stencils is None:
+        stencils = find_stencils(cloud, kernel, default_size(scheme), scheme_size(scheme), images)
+    elif len(stencils) != len(cloud):
+        raise ValueError(f"stencils: built for {len(stencils)} particles, the cloud has {len(cloud)}; build them again")
+    if kernel is None and method in ("I", "II"):
+        kernel = _default_kernel(cloud, stencils)
+    disc = Discretization(
+        cloud, kernel, stencils, traced, rec, groups, scheme, [], held, partner, images, n_own, given_stencils
+    )
+    disc.classes = sorted_classes(disc, np.flatnonzero(~held.all(axis=1)), stencils)
+    return disc
+
+
+def sorted_classes(disc: Discretization, ids: np.ndarray, stencils: Stencils) -> list[Class]:
+    """The particles ``ids`` sorted by the number of their own conditions and the width of their stencils."""
+    near = stencils.indices
+    if is_traced(near):
+        wide = np.zeros(len(ids), bool)
+        used = [near.shape[1]] * 2
+    else:
+        counts = np.max(np.where(near[ids] >= 0, np.arange(near.shape[1]), 0), axis=1, initial=0) + 1
+        narrow = int(np.quantile(counts, 0.8)) if len(ids) else 1
+        wide = counts > 1.25 * narrow
+        used = [int(counts[~wide].max(initial=1)), near.shape[1]]
+    classes = []
+    for count in np.unique(disc.n_own[ids]):
+        for some in (ids[(disc.n_own[ids] == count) & (wide == k)] for k in (False, True)):
+            if len(some):
+                width = used[int(wide[np.searchsorted(ids, some[0])])]
+                classes.append(Class(some, near[some][:, :width], replace(disc.scheme, n_own=int(count))))
+    return classes
+
+
+def table(disc: Discretization) -> Any:
+    """All stencils in one padded array (N, w), repaired ones too."""
+    near = disc.stencils.indices
+    if is_traced(near) or not disc.classes:
+        return near
+    width = max(near.shape[1], *(c.neighbours.shape[1] for c in disc.classes))
+    out = np.full((len(near), width), -1, np.int32)
+    out[:, : near.shape[1]] = near
+    for c in disc.classes:
+        out[c.ids] = -1
+        out[c.ids, : c.neighbours.shape[1]] = c.neighbours
+    return out
+
+
+def _conditions_layout(groups: list[Group], rec: Recursion) -> dict[str, Any]:
+    """The slots of all own conditions, and of those that only neighbours can use.
+
+    Where a group's values are all held, no equation of its own carries its other conditions
+    (the slope of a clamped plate): they are data for the neighbours.
+    """
+    zero = (0,) * rec.dim
+    own = tuple(dict.fromkeys(slot for g in groups for slot in [*((k, zero) for k in g.held), *g.slots]))
+    shut = [g for g in groups if closed(g, rec)]
+    data = tuple(dict.fromkeys(slot for g in shut for slot in g.slots))
+    return {"own": own, "data": data, "n_data": max((g.n_rows for g in shut), default=0)}
+
+
+def closed(group: Group, rec: Recursion) -> bool:
+    """Whether all values of a group are held and yet more conditions are given."""
+    return len(group.held) == rec.fields and bool(group.parts)
+
+
+def _check_operator(traced: Traced, problem: Problem, order: int) -> None:
+    if traced.n_equations != problem.fields:
+        raise ValueError(
+            f"pde: returns {traced.n_equations} residual(s) for fields={problem.fields}; "
+            "a system of F fields needs F residuals"
+        )
+    for e, m in enumerate(traced.order):
+        if m < 0:
+            raise ValueError(f"pde: residual {e} does not depend on u; use u(x), js.grad(u)(x), js.laplacian(u)(x) ...")
+        if m > order:
+            raise ValueError(
+                f"order: {order} is below the order {m} of the equation; use order={m} or more (even orders pay)"
+            )
+    for k in range(problem.fields):
+        if not any(f == k for f, _ in traced.slots):
+            raise ValueError(f"pde: field {k} appears in no equation; lower fields={problem.fields} or use it")
+
+
+def _scheme(method: str, rec: Recursion, traced: Traced, problem: Problem, cloud: Cloud, basis_terms: Any) -> Scheme:
+    """The method and its free coefficients."""
+    if method in ("S", "SSPH"):
+        if basis_terms is not None:
+            raise ValueError(f"basis_terms: only I, II and III keep single free coefficients, not method={method!r}")
+        return Scheme(method, rec)
+    if problem.fields > 1:
+        raise ValueError(f'method: {method} treats one field, the problem has {problem.fields}; use method="S"')
+    slots = None if traced.linear else np.zeros((len(traced.slots), 1, len(cloud)))
+    jac, _ = traced.coefficients(cloud.points, 0, params=problem.params, slots=slots)
+    jac = None if is_traced(jac) else np.asarray(jac)[0, :, 0]
+    free, dependent = free_indices(rec, jac)
+    if basis_terms is not None:
+        if isinstance(basis_terms, bool) or not 1 <= basis_terms <= len(free):
+            raise ValueError(
+                f"basis_terms: expected 1 to {len(free)} free coefficients at this order, got {basis_terms}"
+            )
+        free = free[:basis_terms]
+    return Scheme(method, rec, tuple(map(int, free)), tuple(map(int, dependent)))
+
+
+def scheme_size(scheme: Scheme) -> int:
+    """Free coefficients per field: how many neighbours a fit needs at the least."""
+    rec = scheme.rec
+    if scheme.method == "SSPH":
+        return rec.size
+    if scheme.free:
+        return len(scheme.free)
+    return -(-(rec.fields * rec.size - rec.n_rows) // rec.fields)
+
+
+def default_size(scheme: Scheme) -> int:
+    """Neighbours, the particle itself counted, that make a good fit."""
+    free = scheme_size(scheme)
+    return min(2 * free + 2, 5) if scheme.rec.dim == 1 and scheme.rec.fields == 1 else 2 * free + 2
+
+
+def find_stencils(
+    cloud: Cloud, kernel: Kernel | None, size: int, needed: int, images: Images | None = None
+) -> Stencils:
+    """Neighbours from the kernel's support, or the nearest ``size`` without a kernel."""
+    if is_traced(cloud.points) or is_traced(kernel):
+        what = "kernel's h or d" if is_traced(kernel) else "points"
+        raise ValueError(
+            f"stencils: the {what} is traced by a JAX transform, and neighbours are found on the host; "
+            "build stencils = js.stencils(cloud, radius=...) before the transform and pass stencils=stencils to solve"
+        )
+    points = np.asarray(cloud.points) if images is None else images.searched(np.asarray(cloud.points))
+    which = None if images is None or not len(images.owner) else np.arange(len(cloud))
+    if kernel is None:
+        if len(points) < needed + 1:
+            raise ValueError(
+                f"cloud: {len(points)} particles are too few for this order, which needs at least {needed + 1} "
+                "in every stencil; lower the order or add particles"
+            )
+        return nearest(points, min(size, len(points)), which)
+    return within(points, np.asarray(kernel.d) * np.asarray(kernel.h), which)
+
+
+def _default_kernel(cloud: Cloud, stencils: Stencils) -> Kernel:
+    """A Gauss function per particle that has fallen to exp(-4) at its farthest neighbour."""
+    near, points = stencils.indices, cloud.points
+    xp = jnp if is_traced(near, points) else np
+    square = xp.sum((points[xp.maximum(near, 0)] - points[:, None]) ** 2, axis=2)
+    return Gaussian(xp.sqrt(xp.max(xp.where(near >= 0, square, 0.0), axis=1)) / 2.0, 2.0)

@@ -1,0 +1,132 @@
+"""The numbers of a problem: Taylor coefficients of its operator and source, and its conditions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from jsmitsm.boundary import is_traced, merged
+from jsmitsm.layout import Discretization, closed
+from jsmitsm.problem import Problem
+from jsmitsm.recursion import Recursion, Slot, source_rows
+from jsmitsm.series import Ring, mul
+from jsmitsm.taylor import factorial, index_of, multi_indices
+
+
+@dataclass
+class Numbers:
+    """The numbers of a linear (or linearised) problem: everything that may be traced.
+
+    jac (E, S, T, n or 1) and source (rows, n or 1) at the particles ``ids`` (ascending); own (m, n_own, S) and
+    given (m, n_own) at the particles ``own_ids``; held (N, F); data (N, n_data, S) and gamma
+    (N, n_data), the conditions that neighbours use.
+    """
+
+    ids: np.ndarray
+    jac: Any
+    source: Any
+    own_ids: np.ndarray
+    own: Any
+    given: Any
+    held: Any
+    data: Any
+    gamma: Any
+
+
+def numbers(disc: Discretization, problem: Problem, taylor: Any = None, everywhere: bool = False) -> Numbers:
+    """Evaluate the operator's Taylor coefficients, the source and the conditions.
+
+    taylor (N, F, K): the current local expansions, where the problem is nonlinear.
+    everywhere: also at particles whose values are held, which carry no equation.
+    """
+    everywhere = everywhere or disc.scheme.method in ("I", "II")  # neighbours recover derivatives too
+    ids = np.arange(len(disc.cloud)) if everywhere else disc.active
+    here = None if taylor is None else taylor[ids]
+    jac, source = operator_numbers(disc, problem, disc.cloud.points[ids], here)
+    held = np.zeros(disc.held.shape)
+    for group in disc.groups:
+        for k, value in group.held.items():
+            held = _set(held, (group.ids, k), value())
+    own_ids, own, given = _own_numbers(disc, taylor)
+    data, gamma = _data_numbers(disc, taylor)
+    return Numbers(ids, jac, source, own_ids, own, given, held, data, gamma)
+
+
+def operator_numbers(disc: Discretization, problem: Problem, points: Any, taylor: Any) -> tuple[Any, Any]:
+    """Taylor coefficients of the (linearised) operator and the right-hand side of the recursion."""
+    rec, traced = disc.rec, disc.traced
+    if traced.linear:
+        jac, res = traced.coefficients(points, rec.degree, params=problem.params)
+        if res is None:
+            return jac, np.zeros((rec.n_rows, 1))
+    else:
+        # The residual linearised about the local expansion U: R(U) + R'(U) (u - U) = 0.
+        at = slot_series(rec, traced.slots, taylor, rec.degree)
+        jac, res = traced.coefficients(points, rec.degree, params=problem.params, slots=at)
+        ring = Ring(rec.dim, rec.degree)
+        for e in range(jac.shape[0]):
+            change = sum(mul(ring, jac[e, s], at[s]) for s in range(len(traced.slots)) if rec.pattern[e][s])
+            res = _set(res, e, res[e] - change)
+    return jac, source_rows(rec, res)
+
+
+def slot_series(rec: Recursion, slots: tuple[Slot, ...], taylor: Any, degree: int) -> Any:
+    """Taylor coefficients (S, T, n) of the slots' derivatives from local expansions (n, F, K)."""
+    place = index_of(rec.dim, rec.order)
+    out = []
+    for f, b in slots:
+        up = [tuple(ti + bi for ti, bi in zip(t, b)) for t in multi_indices(rec.dim, degree)]
+        index = np.array([place.get(a, 0) for a in up])
+        factor = np.array(
+            [factorial(a) / factorial(t) if a in place else 0.0 for a, t in zip(up, multi_indices(rec.dim, degree))]
+        )
+        out.append((taylor[:, f][:, index] * factor).T)
+    return (jnp if is_traced(taylor) else np).stack(out)
+
+
+def _slot_values(slots: tuple[Slot, ...], rec: Recursion, taylor: Any, ids: np.ndarray) -> Any:
+    """Derivatives (S, n) of the local expansions at the particles themselves."""
+    return None if taylor is None else slot_series(rec, slots, taylor[ids], 0)[:, 0]
+
+
+def _own_numbers(disc: Discretization, taylor: Any) -> tuple[np.ndarray, Any, Any]:
+    """Every conditioned particle's own conditions: held values first, then the functionals."""
+    slots, zero = disc.scheme.own, (0,) * disc.rec.dim
+    ids = np.flatnonzero(disc.n_own)
+    most = int(disc.n_own.max(initial=0))
+    own, given = np.zeros((len(ids), most, len(slots))), np.zeros((len(ids), most))
+    for group in disc.groups:
+        at = np.searchsorted(ids, group.ids)
+        for row, (k, value) in enumerate(group.held.items()):
+            own[at, row, slots.index((k, zero))] = 1.0
+            given = _set(given, (at, row), value())
+    for group in disc.groups:
+        if group.parts:
+            at = np.searchsorted(ids, group.ids)
+            coef, value = merged(group, slots, _slot_values(slots, disc.rec, taylor, group.ids))
+            index = (at[:, None], (len(group.held) + np.arange(coef.shape[1]))[None, :])
+            own, given = _set(own, index, coef), _set(given, index, value)
+    return ids, own, given
+
+
+def _data_numbers(disc: Discretization, taylor: Any) -> tuple[Any, Any]:
+    """The conditions of particles whose values are all held, as data for their neighbours."""
+    scheme, n = disc.scheme, len(disc.cloud)
+    data, gamma = np.zeros((n, scheme.n_data, len(scheme.data))), np.zeros((n, scheme.n_data))
+    for group in disc.groups:
+        if closed(group, disc.rec):
+            coef, value = merged(group, scheme.data, _slot_values(scheme.data, disc.rec, taylor, group.ids))
+            index = (group.ids[:, None], np.arange(coef.shape[1])[None, :])
+            data, gamma = _set(data, index, coef), _set(gamma, index, value)
+    return data, gamma
+
+
+def _set(array: Any, index: Any, value: Any) -> Any:
+    """array[index] = value; in place where both are concrete."""
+    if isinstance(array, np.ndarray) and not is_traced(value, index):
+        array[index] = np.asarray(value)
+        return array
+    return jnp.asarray(array).at[index].set(value)

@@ -1,0 +1,103 @@
+"""Periodic conditions: images of the particles beyond paired groups."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import product
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jsmitsm.clouds import Cloud
+from jsmitsm.problem import Problem
+
+
+@dataclass(frozen=True)
+class Images:
+    """Copies of particles, appended after the N particles of the cloud.
+
+    owner (M,): whose copy each one is; shift (M, D): where it stands relative to it; aside: the
+    particles of second groups, on which images of the first ones fall.
+    """
+
+    n: int
+    owner: np.ndarray
+    shift: np.ndarray
+    aside: np.ndarray
+
+    def extend(self, points: Any) -> Any:
+        """Points (N, D) with the images behind, (N + M, D)."""
+        if not len(self.owner):
+            return points
+        xp = jnp if isinstance(points, jax.core.Tracer) else np
+        return xp.concatenate([points, points[self.owner] + self.shift])
+
+    def searched(self, points: np.ndarray) -> np.ndarray:
+        """What a neighbour search looks at: second groups are moved out of everybody's reach."""
+        found = np.array(self.extend(points))
+        far = 1e3 * (np.ptp(found, axis=0).max() + 1.0)
+        found[self.aside] += far * (1.0 + np.arange(len(self.aside)))[:, None]
+        return found
+
+    def extend_values(self, values: Any) -> Any:
+        """Values (N, ...) with those of the images behind."""
+        if not len(self.owner):
+            return values
+        return (jnp if isinstance(values, jax.core.Tracer) else np).concatenate([values, values[self.owner]])
+
+    def owners(self, index: Any) -> Any:
+        """Neighbour numbers with images replaced by their owners; -1 stays."""
+        if not len(self.owner):
+            return index
+        return np.concatenate([np.arange(self.n), self.owner, [-1]])[index]
+
+
+def periodic_images(problem: Problem, cloud: Cloud) -> tuple[Images, np.ndarray]:
+    """The images that the problem's periodic pairs call for, and every particle's partner.
+
+    The particles of a pair's second group take the values of their partners in the first and
+    carry no equation. Raises ValueError where the groups are no translated copies.
+    """
+    n = len(cloud)
+    partner = np.arange(n)
+    pairs = dict.fromkeys(c.groups for cs in problem.bcs.values() for c in cs if c.kind == "periodic")
+    none = Images(n, np.zeros(0, int), np.zeros((0, cloud.dim)), np.zeros(0, int))
+    if not pairs:
+        return none, partner
+    if isinstance(cloud.points, jax.core.Tracer):
+        raise ValueError("cloud: its points are traced by a JAX transform; periodic partners are found on the host")
+    points = np.asarray(cloud.points)
+    shifts = []
+    for first, second in pairs:
+        shift, match = _matched(points, cloud, first, second)
+        shifts.append(shift)
+        partner[cloud.groups[second]] = cloud.groups[first][match]
+    partner = partner[partner]  # a corner may be an image of an image
+    own = np.flatnonzero(partner == np.arange(n))
+    owner, moved = [], []
+    for steps in product((-1, 0, 1), repeat=len(shifts)):
+        if any(steps):
+            owner.append(own)
+            moved.append(np.broadcast_to(np.array(steps) @ np.array(shifts), (len(own), cloud.dim)))
+    return Images(n, np.concatenate(owner), np.concatenate(moved), np.flatnonzero(partner != np.arange(n))), partner
+
+
+def _matched(points: np.ndarray, cloud: Cloud, first: str, second: str) -> tuple[np.ndarray, np.ndarray]:
+    """The translation from one group to the other, and each second particle's partner."""
+    from scipy.spatial import cKDTree
+
+    for name in (first, second):
+        if name not in cloud.groups:
+            raise ValueError(f"periodic: {name!r} is no group of the cloud; it has {list(cloud.groups)}")
+    a, b = points[cloud.groups[first]], points[cloud.groups[second]]
+    shift = b.mean(axis=0) - a.mean(axis=0) if len(a) == len(b) else b[0] - a[0]
+    size = np.linalg.norm(shift)
+    distance, match = cKDTree(a + shift).query(b)
+    if len(a) != len(b) or distance.max() > 1e-8 * size or len(np.unique(match)) != len(b):
+        raise ValueError(
+            f"periodic: the groups {first!r} ({len(a)} particles) and {second!r} ({len(b)}) are no translated copies "
+            "of each other; give both the same number of particles, one for one"
+        )
+    return shift, match

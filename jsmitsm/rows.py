@@ -1,0 +1,148 @@
+"""The rows and the Taylor coefficients of all particles, class by class."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jsmitsm import assembly, moments
+from jsmitsm.assembly import Operands
+from jsmitsm.boundary import is_traced
+from jsmitsm.kernels import Kernel
+from jsmitsm.layout import Class, Discretization
+from jsmitsm.moments import Elimination, Row, Scheme
+from jsmitsm.neighbours import nearest, within
+from jsmitsm.numbers import Numbers
+
+
+def operands(disc: Discretization, nums: Numbers, ids: np.ndarray, scheme: Scheme, shared: Any) -> Operands:
+    """What the particles ``ids`` need; the particle axis first."""
+    jac = nums.jac
+    if jac.shape[-1] > 1:
+        jac = jac[..., np.searchsorted(nums.ids, ids)]
+    elif shared is not None:
+        jac = np.zeros((1, 1, 1, 1))
+    own = np.zeros((len(ids), 0, len(scheme.own)))
+    if scheme.n_own:
+        own = nums.own[np.searchsorted(nums.own_ids, ids), : scheme.n_own]
+    return Operands(
+        (jnp if is_traced(jac) else np).moveaxis(jac, -1, 0), own, disc.images.extend_values(nums.data), shared
+    )
+
+
+def shared_elimination(disc: Discretization, nums: Numbers) -> Elimination | None:
+    """One elimination for all particles, where the operator allows it."""
+    if not (disc.traced.constant and disc.rec.scale_free):
+        return None
+    if is_traced(nums.jac) or isinstance(nums.jac, jax.Array):
+        return moments.eliminate(disc.scheme, jnp.asarray(nums.jac[..., 0]), 1.0)
+    return moments.eliminate_on_host(disc.scheme, nums.jac[..., 0])
+
+
+def all_rows(disc: Discretization, nums: Numbers) -> tuple[list[Class], list[Row]]:
+    """The rows of every class, and the classes with the neighbours that the rows reach."""
+    shared = shared_elimination(disc, nums)
+    if disc.scheme.method in ("I", "II"):
+        return _two_stage_rows(disc, nums, shared)
+    return disc.classes, [class_rows(disc, nums, cls, shared) for cls in disc.classes]
+
+
+def _two_stage_rows(disc: Discretization, nums: Numbers, shared: Any) -> tuple[list[Class], list[Row]]:
+    """Methods I and II: recover every particle's coefficients, then insert them into the rows."""
+    wide, far = _recovery_kernel(disc)
+    n_free, rec = len(disc.scheme.free), disc.rec
+    parts, constants, order = [], [], []
+    conditioned = np.zeros(len(disc.cloud), int)
+    for group in disc.groups:
+        conditioned[group.ids] = 0 if group.held else group.n_rows
+    for count in np.unique(conditioned):
+        ids = np.flatnonzero(conditioned == count)
+        cls = Class(ids, far[ids], replace(disc.scheme, n_own=int(count)))
+        given = operands(disc, nums, ids, cls.scheme, shared)
+        made = assembly.recoveries(cls.scheme, disc.points, wide, ids, cls.neighbours, given)
+        source, values = right_sides(disc, nums, cls)
+        constants.append(
+            jnp.einsum("nbr,nr->nb", made.source, source) + jnp.einsum("nbk,nk->nb", made.condition, values)
+        )
+        parts.append(made._replace(source=jnp.zeros((len(ids), n_free, 0)), condition=jnp.zeros((len(ids), n_free, 0))))
+        order.append(ids)
+    back = np.argsort(np.concatenate(order))
+    recovered = jax.tree.map(lambda *x: jnp.concatenate(x)[back], *parts)
+    constant = jnp.concatenate(constants)[back]
+    classes, rows = [], []
+    for cls in disc.classes:
+        given = operands(disc, nums, cls.ids, cls.scheme, shared)
+        reached, row = assembly.closed_rows(
+            cls.scheme, disc.points, disc.kernel, cls.ids, cls.neighbours, given, (), (far, recovered, constant)
+        )
+        classes.append(replace(cls, neighbours=reached if is_traced(reached) else np.asarray(reached)))
+        rows.append(row)
+    return classes, rows
+
+
+def _recovery_kernel(disc: Discretization) -> tuple[Kernel, Any]:
+    """The kernel of stage 1 and its neighbours: wide enough to hold 1.5 times the free coefficients."""
+    points, kernel, near = disc.points, disc.kernel, disc.stencils.indices
+    count = math.ceil(1.5 * len(disc.scheme.free)) + 1
+    if disc.given_stencils or is_traced(near, points, kernel):
+        away = jnp.where(near >= 0, jnp.sum((points[jnp.maximum(near, 0)] - points[:, None]) ** 2, axis=2), jnp.inf)
+        reach = jnp.sqrt(jnp.sort(away, axis=1)[:, min(count, near.shape[1]) - 1])
+        reach = jnp.where(jnp.isfinite(reach), reach, 0.0)
+        return kernel.replace(h=jnp.maximum(kernel.h, reach / (0.9 * kernel.d))), near
+    host = np.asarray(points)
+    reach = nearest(host, min(count, len(host))).radius
+    h = np.maximum(np.asarray(kernel.h), reach / (0.9 * np.asarray(kernel.d)))
+    return kernel.replace(h=h), within(host, h * np.asarray(kernel.d)).indices
+
+
+def class_rows(disc: Discretization, nums: Numbers, cls: Class, shared: Any) -> Row:
+    """The rows of one class of particles."""
+    given = operands(disc, nums, cls.ids, cls.scheme, shared)
+    return assembly.rows(cls.scheme, disc.points, disc.kernel, cls.ids, cls.neighbours, given)
+
+
+def class_coefficients(disc: Discretization, nums: Numbers, cls: Class, shared: Any, u: Any) -> Any:
+    """Taylor coefficients (n, F, K) of one class of particles from all values u (N, F)."""
+    given = operands(disc, nums, cls.ids, cls.scheme, shared)
+    source, values = right_sides(disc, nums, cls)
+    return assembly.coefficients(
+        cls.scheme,
+        disc.points,
+        disc.kernel,
+        cls.ids,
+        cls.neighbours,
+        given,
+        (source, values),
+        (disc.images.extend_values(u), disc.images.extend_values(nums.gamma)),
+    )
+
+
+def right_sides(disc: Discretization, nums: Numbers, cls: Class) -> tuple[Any, Any]:
+    """The recursion's right-hand side (n, rows) and the own conditions' values (n, n_own)."""
+    n = len(cls.ids)
+    xp = jnp if is_traced(nums.source) else np
+    source = nums.source
+    if source.shape[1] > 1:
+        source = source[:, np.searchsorted(nums.ids, cls.ids)]
+    source = xp.broadcast_to(source, (source.shape[0], n)).T
+    if not cls.scheme.n_own:
+        return source, np.zeros((n, 0))
+    return source, nums.given[np.searchsorted(nums.own_ids, cls.ids), : cls.scheme.n_own]
+
+
+def all_coefficients(disc: Discretization, nums: Numbers, values: Any) -> Any:
+    """Taylor coefficients (N, F, K) of the particles of all classes; zeros elsewhere."""
+    shared = shared_elimination(disc, nums)
+    parts = [class_coefficients(disc, nums, c, shared, values) for c in disc.classes]
+    shape = (len(disc.cloud), disc.rec.fields, disc.rec.size)
+    ids = np.concatenate([c.ids for c in disc.classes])
+    if is_traced(parts):
+        return jnp.zeros(shape).at[ids].set(jnp.concatenate(parts))[disc.partner]
+    out = np.zeros(shape)
+    out[ids] = np.concatenate([np.asarray(p) for p in parts])
+    return out[disc.partner]

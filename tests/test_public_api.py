@@ -1,0 +1,260 @@
+"""The package from outside: its names, what importing it costs, what it leaves alone."""
+
+import ast
+import inspect
+import os
+import pathlib
+import pickle
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import manufactured as mm
+import numpy as np
+import pytest
+
+import jsmitsm as js
+from jsmitsm import assembly
+
+NAMES = """
+    Cloud interval rectangle box from_sdf from_polygon
+    Kernel SuperGaussian Gaussian Wendland CubicSpline Constant
+    Problem dirichlet neumann robin condition periodic fix free
+    grad laplacian divergence hessian partial multi_indices
+    solve stencils factorize Solution SolveError
+""".split()
+PACKAGE = pathlib.Path(js.__file__).parent
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_public_name_is_there_and_says_what_it_is(name):
+    member = getattr(js, name)
+    assert callable(member)
+    if not inspect.isclass(member) or "__init__" in vars(member):
+        assert inspect.getdoc(member), f"{name} has no docstring"
+
+
+def test_the_signature_of_solve():
+    parameters = inspect.signature(js.solve).parameters
+    usual = {k: p.default for k, p in parameters.items() if p.kind is p.KEYWORD_ONLY}
+    expected = {"method": "S", "order": 4, "kernel": None, "stencils": None, "basis_terms": None,
+                "formulation": "auto", "solver": "auto", "u0": None, "throw": True}  # fmt: skip
+    assert list(parameters)[:2] == ["problem", "cloud"]
+    assert {k: usual[k] for k in expected} == expected
+
+
+# ------------------------------------------------------------------ importing
+
+
+def imports():
+    """Module -> the package's modules it imports at import time (not inside functions)."""
+    found = {}
+    for path in PACKAGE.glob("*.py"):
+        if path.stem == "__init__":
+            continue
+        names = set()
+        for node in ast.parse(path.read_text()).body:
+            if isinstance(node, ast.ImportFrom) and node.module:
+                if node.module == "jsmitsm":
+                    names |= {alias.name for alias in node.names}
+                elif node.module.startswith("jsmitsm."):
+                    names.add(node.module.split(".")[1])
+        found[path.stem] = names & {p.stem for p in PACKAGE.glob("*.py")}
+    return found
+
+
+def test_imports_run_one_way():
+    """The graph of the modules' imports has an order: peel off what imports nothing that is left."""
+    left = imports()
+    while left:
+        leaves = [name for name, uses in left.items() if not uses & set(left)]
+        assert leaves, f"a ring of imports among {sorted(left)}"
+        left = {name: uses for name, uses in left.items() if name not in leaves}
+
+
+def test_rooms_stand_in_their_order():
+    """Geometry, calculus, weights, the joint, the result: no room knows a later one."""
+    order = ("taylor", "operators", "trace", "clouds", "kernels", "neighbours", "problem", "recursion", "moments",
+             "assembly", "solution", "solve")  # fmt: skip
+    graph = imports()
+
+    def reached(name):
+        todo, seen = [name], set()
+        while todo:
+            for other in graph[todo.pop()] - seen:
+                seen.add(other)
+                todo.append(other)
+        return seen
+
+    for k, name in enumerate(order):
+        later = reached(name) & set(order[k + 1 :])
+        assert not later, f"{name} knows {later}"
+
+
+def in_a_fresh_process(code, **environment):
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120,
+                          env={**os.environ, "PYTHONPATH": str(PACKAGE.parent), **environment})  # fmt: skip
+    assert done.returncode == 0, done.stderr[-2000:]
+    return done.stdout.strip()
+
+
+def test_importing_is_light_and_changes_nothing():
+    """No scipy.spatial, no scipy.sparse, no matplotlib; not one option of JAX, nor numpy's, nor a backend started."""
+    code = """
+import sys, warnings
+import jax, numpy as np
+import jax._src.xla_bridge as bridge
+before = dict(jax.config.values), np.geterr(), np.get_printoptions(), list(warnings.filters)
+import jsmitsm
+assert before == (dict(jax.config.values), np.geterr(), np.get_printoptions(), list(warnings.filters))
+assert not bridge._backends, "importing started a backend"
+heavy = ("scipy.spatial", "scipy.sparse", "scipy.optimize", "matplotlib", "optax", "pyamg", "meshio", "shapely", "tqdm")
+print([name for name in heavy if name in sys.modules])
+"""
+    before = "import jax, sys; print([n for n in ('scipy.spatial', 'scipy.sparse', 'scipy.optimize') if n in sys.modules])"
+    by_jax = ast.literal_eval(in_a_fresh_process(before))
+    assert set(ast.literal_eval(in_a_fresh_process(code))) <= set(by_jax)
+
+
+def test_importing_costs_little_over_jax():
+    """0.2 s of processor time, the least of three: a busy machine must not fail it."""
+    code = """
+import time, jax
+start = time.process_time()
+import jsmitsm
+print(time.process_time() - start)
+"""
+    assert min(float(in_a_fresh_process(code)) for _ in range(3)) < 0.2
+
+
+# ------------------------------------------------------------------ objects
+
+CLOUD = mm.jittered(1, 12)
+EXACT = mm.polynomial(1, 4)
+PROBLEM = js.Problem(mm.with_source(mm.laplace, EXACT), mm.conditions(1, EXACT, "dirichlet"))
+
+
+@pytest.fixture(scope="module")
+def solution():
+    return js.solve(PROBLEM, CLOUD)
+
+
+def test_a_solution_pickles_without_the_users_functions(solution):
+    """Lambdas do not pickle, and need not: the local polynomials do."""
+    points = np.array([[0.13], [0.77]])
+    back = pickle.loads(pickle.dumps(solution))
+    assert np.array_equal(back.u, solution.u)
+    assert np.array_equal(back(points), solution(points)) and np.array_equal(back.grad(points), solution.grad(points))
+    assert np.array_equal(back.coefficients, solution.coefficients)
+    assert back.converged and back.method == "S" and back.order == 4
+    assert back.diagnose() == solution.diagnose()
+
+
+def test_a_solution_is_a_pytree(solution):
+    leaves, shape = jax.tree.flatten(solution)
+    back = jax.tree.unflatten(shape, leaves)
+    assert np.array_equal(back.u, solution.u) and back.order == solution.order
+    doubled = jax.tree.map(lambda x: x, solution)
+    assert np.array_equal(doubled(np.array([[0.4]])), solution(np.array([[0.4]])))
+
+
+def test_what_a_solution_holds(solution):
+    n, k = len(CLOUD), len(js.multi_indices(1, 4))
+    assert solution.u.shape == (n,) and solution.coefficients.shape == (n, k)
+    points = np.array([[0.1], [0.2], [0.3]])
+    assert solution(points).shape == (3,) and solution.grad(points).shape == (3, 1)
+    assert solution.iterations == 1 and bool(solution.converged)
+    assert isinstance(solution.stats, dict) and isinstance(solution.diagnose(), str)
+    # The polynomial of degree 4 itself: coefficients d^a u / a! at the particle, round-off times a
+    # condition number below 1e4 (and the fourth power of 1 / h in the highest one).
+    x = CLOUD.points[:, 0]
+    assert np.allclose(solution.coefficients[:, 0], mm.values(EXACT, CLOUD.points), atol=1e-12)
+    assert np.allclose(solution.coefficients[:, 1], [float(js.grad(EXACT)(v)[0]) for v in CLOUD.points], atol=1e-10)
+    assert np.allclose(solution(points), mm.values(EXACT, points), atol=1e-12) and len(x) == n
+
+
+def test_a_problem_is_a_pytree_of_its_numbers():
+    problem = js.Problem(lambda u, x, p: js.laplacian(u)(x) - p["s"], {"left": js.dirichlet(1.0), "right": js.neumann(2.0)},
+                         params={"s": 3.0})  # fmt: skip
+    leaves, shape = jax.tree.flatten(problem)
+    assert sorted(leaves) == [1.0, 2.0, 3.0]
+    back = jax.tree.unflatten(shape, leaves)
+    assert back.pde is problem.pde and back.params == {"s": 3.0} and back.bcs["left"][0].value == 1.0
+    assert problem.replace(params={"s": 4.0}).params == {"s": 4.0} and problem.params == {"s": 3.0}
+
+
+def test_reprs_are_short(solution):
+    kernel = js.SuperGaussian(np.full(12, 0.1), 3.0)
+    for thing in (solution, CLOUD, PROBLEM, kernel, js.stencils(CLOUD, size=5), js.dirichlet(np.zeros(1000))):
+        assert len(repr(thing)) < 200 and "\n" not in repr(thing), repr(thing)
+
+
+# ------------------------------------------------------------------ compilations
+
+
+class Compilations:
+    """How often JAX compiled anything between two looks, by its own monitoring events."""
+
+    def __init__(self):
+        self.count = 0
+        jax.monitoring.register_event_duration_secs_listener(self._listen)
+
+    def _listen(self, event, *_, **__):
+        self.count += event == "/jax/core/compile/backend_compile_duration"
+
+
+@pytest.fixture(scope="module")
+def compiled():
+    return Compilations()
+
+
+def wave(strength):
+    """A fresh lambda at every call, with another number in it."""
+    return js.Problem(lambda u, x: js.laplacian(u)(x) - jnp.asarray(strength) * jnp.sin(x[0]),
+                      {"left": js.dirichlet(0.0), "right": js.robin(1.0, 1.0, strength)})  # fmt: skip
+
+
+def stirred(cloud, seed):
+    x = cloud.points.copy()
+    inside = cloud.groups["interior"]
+    x[inside] += 0.1 * cloud.spacing * np.random.default_rng(seed).uniform(-1, 1, x[inside].shape)
+    return js.Cloud(x, cloud.groups, cloud.normals)
+
+
+AGAIN = {
+    "the same": lambda: (wave(1.0), CLOUD),
+    "a fresh lambda with another number": lambda: (wave(2.0), CLOUD),
+    "other particles": lambda: (wave(1.0), stirred(CLOUD, 3)),
+    "another number of particles": lambda: (wave(1.0), mm.jittered(1, 14, seed=5)),
+    "a scaled domain": lambda: (wave(1.0), js.Cloud(3.0 * CLOUD.points, CLOUD.groups, CLOUD.normals)),
+}
+
+
+@pytest.mark.parametrize("again", AGAIN)
+def test_a_second_solve_compiles_nothing(again, compiled):
+    js.solve(wave(1.0), CLOUD)
+    problem, cloud = AGAIN[again]()
+    before, traces = compiled.count, dict(assembly.TRACES)
+    sol = js.solve(problem, cloud)
+    assert sol.converged
+    assert assembly.TRACES == traces
+    assert compiled.count == before
+
+
+def test_new_params_compile_nothing(compiled):
+    problem = js.Problem(
+        lambda u, x, p: js.laplacian(u)(x) - p["k"] * u(x) - p["s"],
+        {"left": js.dirichlet(0.0), "right": js.dirichlet(1.0)}, params={"k": 1.0, "s": 2.0},
+    )  # fmt: skip
+    first = js.solve(problem, CLOUD)
+    before, traces = compiled.count, dict(assembly.TRACES)
+    second = js.solve(problem.replace(params={"k": 3.0, "s": -1.0}), CLOUD)
+    assert np.abs(np.asarray(first.u) - np.asarray(second.u)).max() > 0.1
+    assert assembly.TRACES == traces and compiled.count == before
+
+
+def test_the_counter_of_compilations_works(compiled):
+    before = compiled.count
+    jax.jit(lambda x: x * 3.0 + jnp.tan(x))(np.ones(17))
+    assert compiled.count > before
