@@ -19,7 +19,7 @@ from jsmitsm.rows import operands, right_sides, shared_elimination
 def matrix(disc: Discretization, classes: list[Class], rows: list[Row]) -> tuple[Any, Any, Any]:
     """The global matrix as coordinates: own u_i - sum_g weights u_g over the unknowns."""
     unknown, fields = disc.unknowns, disc.rec.fields
-    parts = []
+    parts: list[Any] = []
     for cls, row in zip(classes, rows):
         near, xp = disc.images.owners(cls.neighbours), np
         if is_traced(near):
@@ -83,7 +83,8 @@ def least_squares(disc: Discretization, nums: Numbers) -> tuple[Any, Any, Any, A
     unknown, fields = disc.unknowns, disc.rec.fields
     held = nums.held
     n = int(unknown.max(initial=-1)) + 1
-    parts, b = [], np.zeros(n)
+    parts: list[Any] = []
+    b: Any = np.zeros(n)
     for cls in sorted_classes(disc, nums.ids, Stencils(table(disc), None)):
         given = operands(disc, nums, cls.ids, cls.scheme, shared)
         made = assembly.blocks(

@@ -59,7 +59,6 @@ def repaired(
     """
     shared = dz.shared_elimination(disc, nums)
     points = disc.images.searched(np.asarray(disc.cloud.points))
-    health = examine(classes, rows)
     new_classes, new_rows, touched = [], [], []
     for cls, row in zip(classes, rows):
         lebesgue = _score(row)
@@ -89,9 +88,7 @@ def repaired(
         touched.append(best.ids[best.changed])
     after = examine(new_classes, new_rows)
     fixed = np.concatenate(touched) if touched else np.zeros(0, int)
-    return new_classes, new_rows, replace(health, **{
-        "largest": after.largest, "weak": after.weak, "repaired": fixed, "undetermined": after.undetermined
-    })  # fmt: skip
+    return new_classes, new_rows, replace(after, repaired=fixed)
 
 
 def _score(row: Row) -> np.ndarray:

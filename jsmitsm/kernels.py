@@ -91,7 +91,7 @@ class _Named(Kernel):
     """A kernel with a profile of its own: needs only h and d."""
 
     def __init__(self, h: Any, d: Any):
-        self._profile = None
+        self._profile = None  # type: ignore[assignment]  # the class has its own
         self.params = None
         self._set(h, d)
 

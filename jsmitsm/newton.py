@@ -139,27 +139,30 @@ def _start(run: Run, u0: Any) -> tuple[Any, Any]:
         values = values.reshape(n, fields)
     values = jax.lax.stop_gradient(values)
     if concrete(values) is None or is_traced(disc.stencils.indices):
-        taylor = jnp.zeros((n, fields, disc.rec.size)).at[:, :, 0].set(values)
-        return values, taylor
-    values = np.asarray(concrete(values))
-    if not np.isfinite(values).all():
+        return values, jnp.zeros((n, fields, disc.rec.size)).at[:, :, 0].set(values)
+    given = np.asarray(concrete(values))
+    if not np.isfinite(given).all():
         raise ValueError("u0: NaN or infinite values; start from finite ones")
     taylor = np.zeros((n, fields, disc.rec.size))
-    taylor[:, :, 0] = values
-    points = concrete(disc.cloud.points)
+    taylor[:, :, 0] = given
+    points = concrete(disc.points)
     if u0 is not None and points is not None:
-        _add_slopes(taylor, np.asarray(points), np.asarray(disc.stencils.indices), disc.rec.dim, disc.rec.order)
-    return values, taylor
+        near = np.asarray(disc.stencils.indices)
+        owners = disc.images.owners(near)
+        _add_slopes(taylor, np.asarray(points), near, owners, disc.rec.dim, disc.rec.order)
+    return given, taylor
 
 
-def _add_slopes(taylor: np.ndarray, points: np.ndarray, near: np.ndarray, dim: int, order: int) -> None:
+def _add_slopes(
+    taylor: np.ndarray, points: np.ndarray, near: np.ndarray, owners: np.ndarray, dim: int, order: int
+) -> None:
     """First and second Taylor coefficients of the start, by least squares over the neighbours."""
     some = [a for a in multi_indices(dim, min(order, 2)) if sum(a)]
-    offset = np.where((near >= 0)[..., None], points[np.maximum(near, 0)] - points[:, None], 0.0)
+    offset = np.where((near >= 0)[..., None], points[np.maximum(near, 0)] - points[: len(near), None], 0.0)
     length = np.sqrt((offset**2).sum(axis=2).max(axis=1))
     scaled = offset / length[:, None, None]
     p = np.stack([np.prod(scaled ** np.array(a), axis=2) for a in some], axis=2)
-    change = np.where((near >= 0)[..., None], taylor[np.maximum(near, 0), :, 0] - taylor[:, None, :, 0], 0.0)
+    change = np.where((near >= 0)[..., None], taylor[np.maximum(owners, 0), :, 0] - taylor[:, None, :, 0], 0.0)
     fitted = np.linalg.pinv(p, rcond=1e-6) @ change  # (N, some, F)
     powers = length[:, None] ** -np.array([float(sum(a)) for a in some])
     taylor[:, :, 1 : 1 + len(some)] = np.swapaxes(fitted * powers[:, :, None], 1, 2)

@@ -146,6 +146,7 @@ def constraints(rec: Recursion, jac: Any, length: Any, xp: Any = jnp) -> tuple[A
     powers = length ** xp.arange(int(power.max()) + 1)
     values = jac[e, s, t] * factor * powers[power]
     shape = (rec.n_rows, rec.fields * rec.size)
+    matrix: Any
     if xp is np:
         matrix = np.zeros(shape)
         np.add.at(matrix, (row, col), values)

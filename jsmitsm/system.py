@@ -111,7 +111,7 @@ class Run:
         if disc.floating:
             data, r, c, b, points = _bordered(data, r, c, b, points, free % fields, disc.floating)
         try:
-            x = linsolve.solve(
+            x: Any = linsolve.solve(
                 data, r, c, b, n=n + len(disc.floating), points=points, solver=self.solver,
                 elliptic=fields == 1 and not disc.floating, info=self.linear,
             )  # fmt: skip
@@ -119,8 +119,8 @@ class Run:
             at = np.array([u for u in error.unknowns if u < n], int)
             particles = free[at] // fields
             self.fail(
-                f"{error.args[0].rstrip('.')}: particles {_some(particles)}; is a condition missing, a part of the cloud "
-                "not connected, or the operator at a resonance?",
+                f"{error.args[0].rstrip('.')}: particles {_some(particles)}; is a condition missing, a part of the "
+                "cloud not connected, or the operator at a resonance?",
                 particles,
             )
             return np.full(n, np.nan), False
@@ -137,8 +137,8 @@ class Run:
         self.messages.append("The conditions fix the solution only up to a constant; its mean over the particles is 0.")
         if rest > max(COMPATIBLE, self._truncation()):
             self.fail(
-                f"the problem has no solution: nothing fixes the value and the data do not balance (mean residual "
-                f"{rest:.1e} of the data); correct the source or the fluxes, or hold a value with js.dirichlet or js.fix"
+                "the problem has no solution: nothing fixes the value and the data do not balance (mean residual "
+                f"{rest:.1e} of the data); correct the source or the fluxes, or hold a value (js.dirichlet, js.fix)"
             )
 
     def _truncation(self) -> float:

@@ -18,11 +18,13 @@ import jsmitsm as js
 # dim, order: particles along an axis, coarse and fine, and ceilings of the fine error with Dirichlet
 # sides and with one Neumann side, about three times what was seen.
 CASES = {
-    (1, 2): (11, 41, 3e-4, 5e-3), (1, 4): (11, 41, 1.5e-7, 2e-6), (1, 6): (11, 25, 1e-9, 1e-7),
-    (2, 2): (11, 31, 1e-2, 1e-2), (2, 4): (11, 21, 1e-5, 1e-5), (2, 6): (11, 21, 1e-7, 1e-7),
-    (3, 2): (6, 11, 2e-2, 2e-2), (3, 4): (6, 11, 1e-3, 1e-3), (3, 6): (8, 13, 1e-5, 1e-5),
+    (1, 2): (11, 41, 2e-4, 5e-3), (1, 4): (11, 41, 1.2e-7, 2e-6), (1, 6): (11, 25, 6e-10, 1e-7),
+    (2, 2): (11, 31, 1.2e-4, 1e-4), (2, 4): (11, 21, 4e-7, 1.2e-6), (2, 6): (11, 21, 6e-10, 2e-8),
+    (3, 2): (6, 11, 8e-4, 1.3e-3), (3, 4): (6, 11, 4e-6, 4e-5), (3, 6): (8, 13, 2e-8, 5e-7),
 }  # fmt: skip
-SEEDS = {1: 8, 2: 4, 3: 2}
+# Clouds with a Neumann side scatter no more, but cost more: a new shape for every set of repaired particles.
+SEEDS = {(1, "dirichlet"): 8, (1, "neumann"): 4, (2, "dirichlet"): 4, (2, "neumann"): 2, (3, "dirichlet"): 2,
+         (3, "neumann"): 1}  # fmt: skip
 
 
 def exact(x):
@@ -42,7 +44,7 @@ def relative_l2(sol):
 
 
 def typical_error(dim, n, order, kind):
-    errors = [relative_l2(solve(order, kind, mm.jittered(dim, n, 0.25, seed))) for seed in range(SEEDS[dim])]
+    errors = [relative_l2(solve(order, kind, mm.jittered(dim, n, 0.25, seed))) for seed in range(SEEDS[dim, kind])]
     return float(np.exp(np.mean(np.log(errors))))
 
 

@@ -1,0 +1,165 @@
+"""Tuning a kernel without knowing the solution, against a grid search that knows it.
+
+``python -m benchmarks.tuning [names] [--quick]`` tunes (h, d) of the paper's kernel with the objective
+"estimate" from two starts, prints a table and writes ``benchmarks/data/tuning.json``. Errors are
+relative L2 norms over all particles, in percent. ``grid`` is the 10th percentile of the true error over a
+grid of (h, d) within the Lebesgue bound: a choice that needs the exact solution.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jsmitsm as js
+from benchmarks.problems import PAPER, Case
+
+DATA = Path(__file__).parent / "data" / "tuning.json"
+STARTS = (0.7, 2.0)
+METHODS = ("SSPH", "III", "S")
+# Smoothing lengths in spacings and support radii of the grid; supports wider than REACH are left out.
+GRID_H = np.geomspace(0.5, 2.2, 15)
+GRID_D = np.geomspace(1.5, 6.0, 15)
+REACH = 6.0
+BOUND = 1.5
+
+
+@dataclass(frozen=True)
+class Setup:
+    """A problem on a cloud, and another solution of the same operator and cloud.
+
+    orders : the order of SSPH, III and S.
+    """
+
+    name: str
+    case: Case
+    cloud: Callable[[], js.Cloud]
+    orders: tuple[int, int, int]
+    other: Case | None = None
+    smooth: bool = True
+
+
+def _poisson(name: str, lo: tuple, hi: tuple, exact: Callable[[Any], Any], bcs: Any = None) -> Case:
+    """laplacian(u) = f with the solution ``exact``; ``bcs`` as in :class:`benchmarks.problems.Case`."""
+    return Case(name, "", lo, hi, lambda u, x: js.laplacian(u)(x) - js.laplacian(exact)(x), exact, bcs or {})
+
+
+def _diffusion(name: str, exact: Callable[[Any], Any]) -> Case:
+    """div((1 + sin(x + 2y)/2) grad u) = f on the unit square."""
+
+    def operator(u, x):
+        a = lambda y: 1.0 + 0.5 * jnp.sin(y[0] + 2 * y[1])
+        return js.divergence(lambda y: a(y) * js.grad(u)(y))(x)
+
+    return Case(name, "", (0.0, 0.0), (1.0, 1.0), lambda u, x: operator(u, x) - operator(exact, x), exact)
+
+
+def _setups() -> dict[str, Setup]:
+    square, cube = ((0.0, 0.0), (1.0, 1.0)), ((0.0,) * 3, (1.0,) * 3)
+    smooth = lambda x: jnp.exp(x[0]) * jnp.sin(2 * x[1]) + x[0] ** 3 * x[1]
+    peak = lambda w: lambda x: jnp.exp(-((x[0] - 0.45) ** 2 + (x[1] - 0.55) ** 2) / w**2)
+    slab = ((0.0, 0.0), (4.0, 9.0))
+    found = [
+        Setup(
+            "rod (4.1)", PAPER["rod"], lambda: js.interval(0.0, 2.0, 20), (2, 2, 2),
+            _poisson("rod, other", (0.0,), (2.0,), lambda x: jnp.sin(2 * x[0]) + jnp.exp(x[0] / 2)),
+        ),
+        Setup("plate (4.2)", PAPER["plate"], lambda: js.rectangle(*slab, (9, 19)), (2, 2, 4), smooth=False),
+        Setup(
+            "source (4.3)", PAPER["source"], lambda: js.rectangle(*slab, (9, 19)), (2, 2, 4),
+            _poisson("source, other", *slab, lambda x: jnp.cos(0.8 * x[0] + 0.5) * jnp.cos(0.7 * x[1]),
+                     {"bottom": js.neumann(0.0)}),
+        ),
+        Setup(
+            "oscillatory",
+            _poisson("oscillatory", *square, lambda x: jnp.sin(9 * x[0] + 1) * jnp.cos(8 * x[1])),
+            lambda: js.rectangle(*square, (15, 15)), (2, 2, 4),
+            _poisson("oscillatory, other", *square, lambda x: jnp.sin(7 * x[0] + 6 * x[1])),
+        ),
+        Setup(
+            "jittered", _diffusion("jittered", smooth), lambda: js.rectangle(*square, (14, 14), jitter=0.25, seed=5),
+            (2, 2, 4), _diffusion("jittered, other", lambda x: jnp.cos(3 * x[0]) * jnp.exp(x[1])),
+        ),
+        Setup(
+            "narrow peak", _poisson("peak", *square, peak(0.12)), lambda: js.rectangle(*square, (17, 17)), (2, 2, 4),
+            _poisson("peak, other", *square, peak(0.2)),
+        ),
+        Setup(
+            "3D", _poisson("3D", *cube, lambda x: jnp.exp(x[0]) * jnp.sin(2 * x[1]) * jnp.cos(x[2])),
+            lambda: js.box(*cube, (7, 7, 7), jitter=0.1, seed=2), (2, 2, 2),
+            _poisson("3D, other", *cube, lambda x: jnp.cos(2 * x[0] + x[1]) * jnp.exp(-x[2])),
+        ),
+    ]  # fmt: skip
+    return {s.name: s for s in found}
+
+
+SETUPS = _setups()
+
+
+@dataclass
+class Bench:
+    """One method on one setup: a solver of the setup's problem at any (h, d), h in spacings."""
+
+    setup: Setup
+    method: str
+    order: int
+    cloud: js.Cloud
+    spacing: float
+    solves: int = 0
+    stencils: js.Stencils | None = field(default=None)
+
+    def error(self, h: float, d: float, case: Case | None = None) -> tuple[float, float]:
+        """True error in percent and largest Lebesgue constant; NaN where the solve fails."""
+        case = case or self.setup.case
+        kernel = js.SuperGaussian(h * self.spacing, d)
+        near = self.stencils if h * d <= REACH else None
+        try:
+            sol = js.solve(case.problem(), self.cloud, method=self.method, order=self.order, kernel=kernel, stencils=near)
+        except js.SolveError:
+            return np.nan, np.nan
+        return 100 * case.error(sol), float(sol.stats["lebesgue_max"])
+
+
+def bench(setup: Setup, method: str) -> Bench:
+    cloud = setup.cloud()
+    from scipy.spatial import cKDTree
+
+    near = cKDTree(cloud.points).query(cloud.points, k=2)[0][:, 1]
+    spacing = float(np.median(near))
+    order = setup.orders[METHODS.index(method)]
+    return Bench(setup, method, order, cloud, spacing, stencils=js.stencils(cloud, radius=REACH * spacing * 1.0001))
+
+
+def grid(b: Bench, thin: int = 1) -> list[tuple[float, float, float, float]]:
+    """(h, d, error, Lebesgue constant) over the grid."""
+    return [(h, d, *b.error(h, d)) for h in GRID_H[::thin] for d in GRID_D[::thin] if h * d <= REACH]
+
+
+def tuned(b: Bench, start: float, **options: Any) -> dict[str, Any]:
+    """Tune from h = start spacings, d = 4, and judge what came out by the exact solution."""
+    begin = time.perf_counter()
+    kernel = js.SuperGaussian(start * b.spacing, 4.0)
+    found = js.tune(
+        b.setup.case.problem(), b.cloud, kernel, method=b.method, order=b.order, progress=False, **options
+    )
+    h, d = float(found.kernel.h) / b.spacing, float(found.kernel.d)
+    error, lebesgue = b.error(h, d)
+    nearby = [b.error(h * a, d * c)[0] for a, c in ((1.01, 1), (0.99, 1), (1, 1.01), (1, 0.99))]
+    out = {
+        "h": h, "d": d, "start": b.error(start, 4.0)[0], "tuned": error, "lebesgue": lebesgue,
+        "one_percent": max(abs(e / error - 1) if np.isfinite(e) else np.inf for e in nearby),
+        "solves": found.solves, "seconds": time.perf_counter() - begin, "messages": found.messages,
+        "history": {k: np.asarray(v).tolist() for k, v in found.history.items()},
+    }  # fmt: skip
+    if b.setup.other is not None:
+        out["other"], out["other_paper"] = b.error(h, d, b.setup.other)[0], b.error(1.0, 4.0, b.setup.other)[0]
+    return out
