@@ -21,9 +21,8 @@ def matrix(disc: Discretization, classes: list[Class], rows: list[Row]) -> tuple
     unknown, fields = disc.unknowns, disc.rec.fields
     parts: list[Any] = []
     for cls, row in zip(classes, rows):
-        near, xp = disc.images.owners(cls.neighbours), np
-        if is_traced(near):
-            xp = jnp
+        near = disc.images.owners(cls.neighbours)
+        xp: Any = jnp if is_traced(near) else np
         number = xp.asarray(unknown)
         own = unknown[cls.ids]
         col = xp.where((near >= 0)[..., None], number[near], -1)  # (n, w, F)
@@ -46,10 +45,15 @@ def matrix(disc: Discretization, classes: list[Class], rows: list[Row]) -> tuple
     n = int(unknown.max(initial=-1)) + 1
     if disc.scheme.method != "SSPH":
         parts.append((np.ones(n), np.arange(n), np.arange(n)))
-    traced = is_traced(parts)
-    join = jnp.concatenate if traced else np.concatenate
-    data, r, c = zip(*parts)
-    return join(data), (jnp if is_traced(r) else np).concatenate(r), (jnp if is_traced(c) else np).concatenate(c)
+    return _joined(parts)
+
+
+def _joined(parts: list[tuple[Any, Any, Any]]) -> tuple[Any, Any, Any]:
+    """Entries and their places, each in one array; places stay on the host where they can."""
+    values, at, to = zip(*parts)
+    join = jnp.concatenate if is_traced(values) else np.concatenate
+    where = jnp.concatenate if is_traced(at, to) else np.concatenate
+    return join(values), where(at), where(to)
 
 
 def right_side(disc: Discretization, nums: Numbers, classes: list[Class], rows: list[Row]) -> Any:
@@ -80,8 +84,7 @@ def least_squares(disc: Discretization, nums: Numbers) -> tuple[Any, Any, Any, A
     projector of a fit is idempotent, so nothing is squared.
     """
     shared = shared_elimination(disc, nums)
-    unknown, fields = disc.unknowns, disc.rec.fields
-    held = nums.held
+    unknown, held = disc.unknowns, nums.held
     n = int(unknown.max(initial=-1)) + 1
     parts: list[Any] = []
     b: Any = np.zeros(n)
@@ -115,14 +118,7 @@ def least_squares(disc: Discretization, nums: Numbers) -> tuple[Any, Any, Any, A
             else:
                 at = np.nonzero(np.asarray(keep))
                 parts.append((matrix[:, :m, :m][at], np.asarray(r)[at], np.asarray(c)[at]))
-    data, r, c = zip(*parts)
-    xp = jnp if is_traced(parts) else np
-    return (
-        xp.concatenate(data),
-        (jnp if is_traced(r) else np).concatenate(r),
-        (jnp if is_traced(c) else np).concatenate(c),
-        b,
-    )
+    return *_joined(parts), b
 
 
 def prefers_least_squares(disc: Discretization, nums: Numbers) -> bool:

@@ -286,7 +286,7 @@ def block(scheme: Scheme, near: Support, solution: Elimination, own: Any, data: 
     a = root[:, None] * system.phi
     misfit = jnp.diag(system.weight) - root[:, None] * (a @ solve_gram(a, gram_inverse(a), a.T)) * root
     # Physical data are scaled like the unknowns inside the fit.
-    ns, fields = near.weight.shape[0], scheme.rec.fields
+    ns = near.weight.shape[0]
     power = near.length ** jnp.asarray(scheme.rec.weights, near.length.dtype)
     scale = jnp.concatenate([jnp.tile(power, ns), system.data_scale.reshape(-1)])
     return Block(scale[:, None] * misfit * scale, scale * (misfit @ (system.values @ part)))

@@ -55,7 +55,7 @@ def all_rows(disc: Discretization, nums: Numbers) -> tuple[list[Class], list[Row
 def _two_stage_rows(disc: Discretization, nums: Numbers, shared: Any) -> tuple[list[Class], list[Row]]:
     """Methods I and II: recover every particle's coefficients, then insert them into the rows."""
     wide, far = _recovery_kernel(disc)
-    n_free, rec = len(disc.scheme.free), disc.rec
+    n_free = len(disc.scheme.free)
     parts, constants, order = [], [], []
     conditioned = np.zeros(len(disc.cloud), int)
     for group in disc.groups:

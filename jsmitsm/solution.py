@@ -102,7 +102,8 @@ class Solution:
         b = tuple(int(v) for v in multi_index)
         if len(b) != self.cloud.dim or min(b) < 0 or sum(b) > self.order:
             raise ValueError(
-                f"multi_index: expected {self.cloud.dim} non-negative orders of sum at most {self.order}, got {multi_index!r}"
+                f"multi_index: expected {self.cloud.dim} orders of 0 or more with a sum of at most {self.order}, "
+                f"got {multi_index!r}"
             )
         near, weight = _nearest(self.cloud.points, points, self.cloud.dim + 2 if blend else 1)
         values = _evaluate(b, self.order, self.cloud.points, self._taylor, points, near, weight)

@@ -42,6 +42,7 @@ STRIDE = 0.5
 PATIENCE = 12
 GAIN = 0.005
 RETREATS = 8
+SUPPORT = True
 
 
 @dataclass
@@ -153,6 +154,8 @@ class _Space:
         if groups is not None and "h" in names:
             self.start = kernel.replace(h=np.broadcast_to(np.asarray(kernel.h, float), groups.shape))
         leaves, self.shape = jax.tree.flatten(kernel.params)
+        # A scalar h moves at a fixed support d h: the support has a lower bound, and the search slides along it.
+        self.by_support = {"h", "d"} <= set(names) and not np.ndim(self.start.h) and SUPPORT
         self.moving = [np.asarray(x).dtype.kind == "f" for x in leaves]
 
     def zero(self) -> dict[str, Any]:
@@ -175,6 +178,8 @@ class _Space:
                 changes[name] = jax.tree.unflatten(self.shape, parts)
             else:
                 by = z[name][self.labels] if name == "h" and self.labels is not None else z[name]
+                if name == "d" and self.by_support:
+                    by = by - z["h"]
                 changes[name] = getattr(self.start, name) * jnp.exp(by)
         return self.start.replace(**changes)
 
@@ -191,7 +196,7 @@ class _Space:
             z["h"] = z["h"] + shift
             return z
         shift = up.max() if up.max() > 0 else down.min()
-        share = [n for n in ("h", "d") if n in z]
+        share = ["d"] if self.by_support else [n for n in ("h", "d") if n in z]
         for name in share:
             z[name] = z[name] + shift / len(share)
         return z
@@ -223,6 +228,7 @@ class _Watched(Run):
     def local_rows(self, nums):
         classes, rows = super().local_rows(nums)
         self.seen = jnp.concatenate([jnp.max(r.lebesgue, axis=1) for r in rows]), jnp.concatenate([r.defect for r in rows])
+        self.seen = self.seen[0], jnp.where(jnp.isfinite(self.seen[0]), self.seen[1], jnp.inf)
         return classes, rows
 
 
@@ -251,7 +257,8 @@ class _Scene:
         self.pattern: Stencils | None = None
         self.fit_pattern(kernel, 1.0)
         self.linear = self.disc.linear
-        self.bound: float | None = None
+        self.bound = np.inf
+        self.undetermined = np.zeros(len(cloud), bool)
         self.scale = 1.0
         self.objective = objective
         self.reference = self._reference() if objective == "estimate" else None
@@ -335,10 +342,9 @@ class _Scene:
             value = jnp.sqrt(jnp.mean(apart**2) + 1e-30)
             score = jnp.log(value)
         largest = jnp.max(lebesgue)
-        if self.bound is not None:
-            above = jnp.maximum(jnp.log(lebesgue / self.bound), 0.0)
-            score = score + PENALTY * (jnp.sum(above) if jnp.ndim(kernel.h) else jnp.max(above))
-        return score, (value, largest, jnp.max(defect), found._values)
+        above = jnp.maximum(jnp.log(lebesgue / self.bound), 0.0)
+        score = score + PENALTY * (jnp.sum(above) if jnp.ndim(kernel.h) else jnp.max(above))
+        return score, (value, largest, defect, found._values)
 
 
 def hand_kernel(points: np.ndarray) -> Kernel:
@@ -388,6 +394,7 @@ class _Search:
                 part, point, z = part / 2.0, self.best, self.best.z
                 state = self._fresh(z)
                 scene.messages.append(f"Step {step}: {reason}; back to the best kernel, with half the step.")
+                lowest = self._floor(lowest, new)
                 if retreats == RETREATS:
                     scene.messages.append(f"Stopped after {retreats} steps back.")
                     break
@@ -400,11 +407,18 @@ class _Search:
                 break
         bar.close()
 
+    def _floor(self, lowest: np.ndarray, failed: Any) -> np.ndarray:
+        """The smallest supports admitted, raised half way from those that failed to the best ones."""
+        scene = self.scene
+        support, good = scene.support(_concrete(self.space.kernel(failed))), scene.support(self.best.kernel)
+        raised = np.where(scene.undetermined & (support < good), np.sqrt(support * good), lowest)
+        return np.maximum(lowest, raised)
+
     def _start(self) -> tuple[np.ndarray, Any, _Point]:
         """The first point: the user's kernel, or a wider one where that does not determine the solution."""
         scene, space = self.scene, self.space
         lowest, z = scene.smallest_support(), space.zero()
-        scene.bound = None
+        scene.bound = self._bound()
         point, reason = self._tried(z)
         widen = 1.0
         while point is None and widen < 3.0 and ("h" in z or "d" in z):
@@ -414,15 +428,18 @@ class _Search:
                 scene.messages.append(f"The starting kernel fails ({reason}); started from {point.kernel!r}.")
         if point is None:
             raise SolveError(f"kernel: tuning cannot start from {space.start!r}: {reason}; start from a wider support")
-        self._bound(point)
-        self.points.clear()
-        start, _ = self._tried(z)
-        assert start is not None
-        self._accept(start)
-        return np.minimum(lowest, scene.support(start.kernel)), z, start
+        if not np.isfinite(scene.bound):
+            scene.bound = max(LEBESGUE, point.lebesgue)
+        if scene.reference is None and point.objective:
+            scene.scale = abs(point.objective)
+            self.points.clear()
+            point, reason = self._tried(z)
+            assert point is not None
+        self._accept(point)
+        return np.minimum(lowest, scene.support(point.kernel)), z, point
 
-    def _bound(self, point: _Point) -> None:
-        """The Lebesgue bound and the objective's size, from the start and from the paper's choice."""
+    def _bound(self) -> float:
+        """The Lebesgue bound of the paper's choice; infinite where that fails."""
         scene = self.scene
         o = {k: v for k, v in scene.options.items() if k not in ("stencils", "throw")}
         hand = hand_kernel(scene.points)
@@ -430,10 +447,8 @@ class _Search:
         try:
             usual = solve(scene.problem, scene.cloud, kernel=hand, **o).stats.get("lebesgue_max", 1.0)
         except (ValueError, SolveError):
-            usual = point.lebesgue
-        scene.bound = max(LEBESGUE, usual)
-        size = abs(point.objective)
-        scene.scale = size if size > 0 else 1.0
+            return np.inf
+        return max(LEBESGUE, usual)
 
     def _tried(self, z: Any) -> tuple[_Point | None, str]:
         """Score and gradient at z, or why there is none."""
@@ -441,14 +456,17 @@ class _Search:
         kernel = _concrete(space.kernel(z))
         scene.fit_pattern(kernel)
         scene.solves += 1
+        scene.undetermined = np.zeros(len(scene.cloud), bool)
         try:
             (score, (value, lebesgue, defect, values)), slope = jax.value_and_grad(
                 lambda z: scene.score(space.kernel(z)), has_aux=True
             )(z)
         except SolveError as error:
             return None, str(error)
-        if not float(defect) < DEFECT or not np.isfinite(float(lebesgue)):
-            return None, "the support does not determine the solution"
+        bad = ~(np.asarray(defect) < DEFECT)
+        if bad.any():
+            scene.undetermined[np.concatenate([c.ids for c in scene.disc.classes])[bad]] = True
+            return None, f"the support does not determine the solution at {bad.sum()} particle(s)"
         if not np.isfinite(float(score)) or not np.isfinite(_largest(slope)):
             return None, f"the objective is {float(value)} or has no finite gradient"
         point = _Point(z, kernel, float(score), float(value), float(lebesgue), slope, np.asarray(values))
