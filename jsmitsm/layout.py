@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 
 from jsmitsm.boundary import Group, group_conditions, is_traced
 from jsmitsm.clouds import Cloud
-from jsmitsm.kernels import Gaussian, Kernel
+from jsmitsm.kernels import EDGE, Constant, Gaussian, Kernel
 from jsmitsm.moments import Scheme
 from jsmitsm.neighbours import Stencils, nearest, within
 from jsmitsm.periodic import Images, periodic_images
@@ -86,7 +87,7 @@ def discretize(
     stencils: Stencils | None, basis_terms: int | None,
 ) -> Discretization:  # fmt: skip
     """Trace the problem, lay out its recursion and conditions, and find neighbours."""
-    traced = trace(problem.pde, cloud.dim, problem.fields, params=problem.params)
+    traced = _traced(problem, cloud.dim)
     _check_operator(traced, problem, order)
     rec = recursion(cloud.dim, order, problem.fields, traced.slots, traced.pattern, traced.order)
     groups = group_conditions(problem, cloud, order, max(traced.order))
@@ -103,6 +104,14 @@ def discretize(
     scheme = replace(scheme, **_conditions_layout(groups, rec))
     if len(images.owner) and method in ("I", "II"):
         raise ValueError(f"method: {method} does not follow periodic conditions; use S, III or SSPH")
+    if kernel is not None and not is_traced(kernel) and np.shape(kernel.h) not in ((), (len(cloud),)):
+        raise ValueError(
+            f"kernel: h has shape {np.shape(kernel.h)}, expected a scalar or one per particle, ({len(cloud)},)"
+        )
+    if isinstance(kernel, Constant) and method in ("II", "III"):
+        raise ValueError(
+            f"kernel: the derivatives of js.Constant vanish, and method {method} tests with them; use another kernel"
+        )
     given_stencils = stencils is not None
     if stencils is None:
         stencils = find_stencils(cloud, kernel, default_size(scheme), scheme_size(scheme), images)
@@ -113,6 +122,7 @@ def discretize(
     disc = Discretization(
         cloud, kernel, stencils, traced, rec, groups, scheme, [], held, partner, images, n_own, given_stencils
     )
+    _check_supports(disc)
     disc.classes = sorted_classes(disc, np.flatnonzero(~held.all(axis=1)), stencils)
     return disc
 
@@ -169,6 +179,51 @@ def closed(group: Group, rec: Recursion) -> bool:
     return len(group.held) == rec.fields and bool(group.parts)
 
 
+def _traced(problem: Problem, dim: int) -> Traced:
+    """The residual recorded; whatever goes wrong in it is said to be the pde's."""
+    expected = "pde(u, x)" if problem.params is None else "pde(u, x, params)"
+    try:
+        inspect.signature(problem.pde).bind(*([None] * (2 if problem.params is None else 3)))
+    except TypeError as error:
+        raise ValueError(
+            f"pde: {error}; it is called as {expected}, with params last where the problem has them"
+        ) from None
+    except ValueError:  # a callable without a signature
+        pass
+    try:
+        return trace(problem.pde, dim, problem.fields, params=problem.params)
+    except (TypeError, ValueError) as error:
+        text = str(error)
+        raise ValueError(text if text.startswith("pde") else f"pde: {text}; it returns a number or a scalar per "
+                         "equation") from error  # fmt: skip
+
+
+def _check_supports(disc: Discretization) -> None:
+    """Every moment system needs as many neighbours as it has unknowns."""
+    scheme, near = disc.scheme, disc.stencils.indices
+    if is_traced(near, disc.kernel, disc.points) or (disc.kernel is None and not disc.given_stencils):
+        return
+    near, points = np.asarray(near), np.asarray(disc.points)
+    inside = near >= 0
+    if disc.kernel is not None:
+        offset = points[np.maximum(near, 0)] - points[: len(near), None]
+        reach = np.broadcast_to(np.asarray(disc.kernel.h) * np.asarray(disc.kernel.d), (len(near),))
+        inside &= np.linalg.norm(offset, axis=2) <= reach[:, None] * EDGE
+    counts = inside.sum(axis=1) - (scheme.method != "SSPH")
+    # I and II widen the supports of their first stage themselves.
+    needed = np.full(len(near), 2 if scheme.method in ("I", "II") else scheme_size(scheme))
+    needed -= np.where(disc.n_own > 0, disc.n_own, 0) // scheme.rec.fields
+    few = np.flatnonzero((counts < needed) & ~disc.held.all(axis=1))
+    if len(few):
+        i = few[0]
+        what = "stencils" if disc.kernel is None else "kernel"
+        raise ValueError(
+            f"{what}: {len(few)} particle(s) have too few neighbours, e.g. particle {i} has {counts[i]} of at least "
+            f"{needed[i]} that method {scheme.method} of order {scheme.rec.order} needs; choose larger supports "
+            "(increase h, d, size or radius) or a lower order"
+        )
+
+
 def _check_operator(traced: Traced, problem: Problem, order: int) -> None:
     if traced.n_equations != problem.fields:
         raise ValueError(
@@ -200,9 +255,10 @@ def _scheme(method: str, rec: Recursion, traced: Traced, problem: Problem, cloud
     jac = None if is_traced(jac) else np.asarray(jac)[0, :, 0]
     free, dependent = free_indices(rec, jac)
     if basis_terms is not None:
-        if isinstance(basis_terms, bool) or not 1 <= basis_terms <= len(free):
+        whole = isinstance(basis_terms, (int, np.integer)) and not isinstance(basis_terms, bool)
+        if not whole or not 1 <= basis_terms <= len(free):
             raise ValueError(
-                f"basis_terms: expected 1 to {len(free)} free coefficients at this order, got {basis_terms}"
+                f"basis_terms: expected 1 to {len(free)} free coefficients at this order, got {basis_terms!r}"
             )
         free = free[:basis_terms]
     return Scheme(method, rec, tuple(map(int, free)), tuple(map(int, dependent)))

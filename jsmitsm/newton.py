@@ -133,16 +133,11 @@ def _start(run: Run, u0: Any) -> tuple[Any, Any]:
         points = jax.lax.stop_gradient(disc.cloud.points)
         values = sample(u0, points, run.problem.params, fields, "u0").T
     else:
-        values = u0 if is_traced(u0) else np.asarray(u0, float)
-        if values.shape not in ((n,), (n, fields)):
-            raise ValueError(f"u0: expected a function, ({n},) or ({n}, {fields}), got shape {values.shape}")
-        values = values.reshape(n, fields)
+        values = (u0 if is_traced(u0) else np.asarray(u0, float)).reshape(n, fields)
     values = jax.lax.stop_gradient(values)
     if concrete(values) is None or is_traced(disc.stencils.indices):
         return values, jnp.zeros((n, fields, disc.rec.size)).at[:, :, 0].set(values)
     given = np.asarray(concrete(values))
-    if not np.isfinite(given).all():
-        raise ValueError("u0: NaN or infinite values; start from finite ones")
     taylor = np.zeros((n, fields, disc.rec.size))
     taylor[:, :, 0] = given
     points = concrete(disc.points)

@@ -61,6 +61,7 @@ def operator_numbers(disc: Discretization, problem: Problem, points: Any, taylor
     if traced.linear:
         jac, res = traced.coefficients(points, rec.degree, params=problem.params)
         if res is None:
+            _refuse_nonfinite(points, jac)
             return jac, np.zeros((rec.n_rows, 1))
     else:
         # The residual linearised about the local expansion U: R(U) + R'(U) (u - U) = 0.
@@ -70,7 +71,21 @@ def operator_numbers(disc: Discretization, problem: Problem, points: Any, taylor
         for e in range(jac.shape[0]):
             change = sum(mul(ring, jac[e, s], at[s]) for s in range(len(traced.slots)) if rec.pattern[e][s])
             res = _set(res, e, res[e] - change)
+    if traced.linear:
+        _refuse_nonfinite(points, jac, res)
     return jac, source_rows(rec, res)
+
+
+def _refuse_nonfinite(points: Any, *series: Any) -> None:
+    """Name the point where the operator or the source is not a number."""
+    for values in series:
+        if is_traced(values, points) or np.isfinite(values).all():
+            continue
+        bad = np.flatnonzero(~np.isfinite(np.asarray(values)).all(axis=tuple(range(np.ndim(values) - 1))))
+        raise ValueError(
+            f"pde: NaN or infinity at {len(bad)} particle(s), first at x = {np.asarray(points)[bad[0]]}, in the "
+            "coefficients, the source or their derivatives; they must be finite and smooth there"
+        )
 
 
 def slot_series(rec: Recursion, slots: tuple[Slot, ...], taylor: Any, degree: int) -> Any:

@@ -97,7 +97,7 @@ def _matched(points: np.ndarray, cloud: Cloud, first: str, second: str) -> tuple
     distance, match = cKDTree(a + shift).query(b)
     if len(a) != len(b) or distance.max() > 1e-8 * size or len(np.unique(match)) != len(b):
         raise ValueError(
-            f"periodic: the groups {first!r} ({len(a)} particles) and {second!r} ({len(b)}) are no translated copies "
-            "of each other; give both the same number of particles, one for one"
+            f"periodic: the groups {first!r} ({len(a)} particles) and {second!r} ({len(b)}) are no translation "
+            "of each other (congruent, one for one); give both the same number of particles, one for one"
         )
     return shift, match

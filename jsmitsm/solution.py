@@ -102,7 +102,7 @@ class Solution:
         b = tuple(int(v) for v in multi_index)
         if len(b) != self.cloud.dim or min(b) < 0 or sum(b) > self.order:
             raise ValueError(
-                f"multi_index: expected {self.cloud.dim} orders of 0 or more with a sum of at most {self.order}, "
+                f"multi_index: expected {self.cloud.dim} non-negative orders with a sum of at most {self.order}, "
                 f"got {multi_index!r}"
             )
         near, weight = _nearest(self.cloud.points, points, self.cloud.dim + 2 if blend else 1)
@@ -155,7 +155,12 @@ class Solution:
 
 def _checked_points(points: Any, dim: int) -> Any:
     if not is_traced(points):
-        points = np.asarray(points, dtype=float)
+        try:
+            if np.iscomplexobj(points):
+                raise TypeError
+            points = np.asarray(points, dtype=float)
+        except (TypeError, ValueError):
+            raise ValueError(f"points: expected real numbers of shape (M, {dim}), got {type(points).__name__}") from None
         if points.ndim == 2 and not np.isfinite(points).all():
             raise ValueError("points: NaN or infinite coordinates; evaluate at finite points")
     if points.ndim != 2 or points.shape[1] != dim:

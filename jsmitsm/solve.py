@@ -9,6 +9,7 @@ import jax
 import numpy as np
 
 from jsmitsm import discretize as dz
+from jsmitsm.boundary import is_traced
 from jsmitsm.clouds import Cloud
 from jsmitsm.discretize import Discretization
 from jsmitsm.kernels import Kernel
@@ -108,7 +109,7 @@ def solve(
     True
     """
     start = time.perf_counter()
-    _check(problem, cloud, method, order, kernel, stencils, formulation, solver)
+    _check(problem, cloud, method, order, kernel, stencils, formulation, solver, u0, throw)
     disc = dz.discretize(problem, cloud, method, order, kernel, stencils, basis_terms)
     run = Run(disc, problem, solver, throw, kernel is None and stencils is None, formulation)
     run.seconds["set-up"] = time.perf_counter() - start
@@ -137,7 +138,7 @@ def discretized(
     return dz.discretize(problem, cloud, method, order, kernel, stencils, None)
 
 
-def _check(problem, cloud, method, order, kernel, stencils, formulation, solver) -> None:
+def _check(problem, cloud, method, order, kernel, stencils, formulation, solver, u0=None, throw=True) -> None:
     """Arguments of :func:`solve` that can be judged before any work."""
     for value, kind, name in ((problem, Problem, "problem"), (cloud, Cloud, "cloud")):
         if not isinstance(value, kind):
@@ -155,5 +156,22 @@ def _check(problem, cloud, method, order, kernel, stencils, formulation, solver)
             raise ValueError(f"{name}: {value!r} is none of {', '.join(map(repr, known))}")
     if stencils is not None and any(c.kind == "periodic" for cs in problem.bcs.values() for c in cs):
         raise ValueError("stencils: those of a cloud do not reach periodic images; leave stencils out")
+    if not isinstance(throw, (bool, np.bool_)):
+        raise ValueError(f"throw: expected True or False, got {throw!r}")
+    _check_start(u0, (len(cloud), problem.fields))
     if isinstance(order, bool) or not isinstance(order, (int, np.integer)) or not 1 <= order <= 14:
         raise ValueError(f"order: expected a whole number from 1 to 14, the degree of the expansions, got {order!r}")
+
+
+def _check_start(u0: Any, shape: tuple[int, int]) -> None:
+    """A start for Newton's method: nothing, a function, or finite values of the right shape."""
+    if u0 is None or callable(u0) or is_traced(u0):
+        return
+    try:
+        values = np.asarray(u0, float)
+    except (TypeError, ValueError):
+        raise ValueError(f"u0: expected a function of x or an array, got {u0!r}") from None
+    if values.shape not in (shape, shape[:1]):
+        raise ValueError(f"u0: expected a function, ({shape[0]},) or {shape}, got shape {values.shape}")
+    if not np.isfinite(values).all():
+        raise ValueError("u0: NaN or infinite values; start from finite ones")

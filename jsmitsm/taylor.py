@@ -22,6 +22,8 @@ def multi_indices(dim: int, degree: int) -> tuple[MultiIndex, ...]:
     >>> multi_indices(2, 2)
     ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
     """
+    if isinstance(degree, bool) or int(degree) != degree:
+        raise ValueError(f"degree: expected a whole number, got {degree!r}")
     if dim < 1:
         raise ValueError(f"dim must be at least 1, got {dim!r}")
     return tuple(a for d in range(degree + 1) for a in _of_degree(dim, d))
