@@ -153,6 +153,8 @@ def _move(eqn: Any, facts: list[Facts]) -> list[Facts] | None:
     data = 1 if name in ("gather", "dynamic_slice") else 2 if name == "dynamic_update_slice" else len(facts)
     if not all(f.known.all() for f in facts[data:]):
         return None
+    if name == "dynamic_slice":
+        _refuse_outside(eqn, facts)
     numbers, start = [], 0
     for f in facts[:data]:
         size = int(np.prod(f.shape))
@@ -173,6 +175,17 @@ def _move(eqn: Any, facts: list[Facts]) -> list[Facts] | None:
         p = np.where(inside, p, 0)
         out.append(Facts(values[p], certain[p] & inside, np.where(inside, depends[p], 0).astype(np.uint8)))
     return out
+
+
+def _refuse_outside(eqn: Any, facts: list[Facts]) -> None:
+    """An index beyond an array, as x[1] in 1D: JAX would silently take the last element."""
+    for axis, (length, size, first) in enumerate(zip(facts[0].shape, eqn.params["slice_sizes"], facts[1:])):
+        start = int(first.value)
+        if not 0 <= start <= length - size:
+            raise ValueError(
+                f"index {start} is out of bounds for axis {axis} of an array with {length} element(s); "
+                "does the function use a coordinate that the cloud's dimension does not have?"
+            )
 
 
 def _mul(eqn: Any, facts: list[Facts]) -> list[Facts]:

@@ -91,7 +91,9 @@ def group_conditions(problem: Problem, cloud: Cloud, order: int, highest: int) -
     seconds = {c.groups[1] for cs in given.values() for c in cs if c.kind == "periodic"}
     for name in seconds & set(given):
         if any(c.kind != "periodic" for c in given[name]):
-            raise ValueError(f"bcs[{name!r}]: its particles take the values of their periodic partners; remove the rest")
+            raise ValueError(
+                f"bcs[{name!r}]: its particles take the values of their periodic partners; remove its other conditions"
+            )
     if not any(c.kind not in ("free",) for cs in given.values() for c in cs):
         raise ValueError(f"bcs: no condition on any group ({names}), so the solution is not determined; give one")
     groups = []

@@ -160,7 +160,9 @@ def _checked_points(points: Any, dim: int) -> Any:
                 raise TypeError
             points = np.asarray(points, dtype=float)
         except (TypeError, ValueError):
-            raise ValueError(f"points: expected real numbers of shape (M, {dim}), got {type(points).__name__}") from None
+            raise ValueError(
+                f"points: expected real numbers of shape (M, {dim}), got {type(points).__name__}"
+            ) from None
         if points.ndim == 2 and not np.isfinite(points).all():
             raise ValueError("points: NaN or infinite coordinates; evaluate at finite points")
     if points.ndim != 2 or points.shape[1] != dim:

@@ -137,7 +137,7 @@ class Run:
         self.messages.append("The conditions fix the solution only up to a constant; its mean over the particles is 0.")
         if rest > max(COMPATIBLE, self._truncation()):
             self.fail(
-                "the conditions are incompatible, the problem has no solution: nothing fixes the value and the data do not balance (mean residual "
+                "the conditions are incompatible: nothing fixes the value, and the data do not balance (mean residual "
                 f"{rest:.1e} of the data); correct the source or the fluxes, or hold a value (js.dirichlet, js.fix)"
             )
 
