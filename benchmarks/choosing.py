@@ -1,4 +1,4 @@
-"""The measurements of docs/choosing.md: ``python -m benchmarks.choosing`` (about two minutes).
+"""The measurements of docs/choosing.md: ``python -m benchmarks.choosing`` (some minutes).
 
 Writes benchmarks/data/choosing.json; ``python -m benchmarks.readme`` puts its tables into the pages.
 """
@@ -7,7 +7,6 @@ import argparse
 import json
 import os
 import platform
-import statistics
 import time
 from pathlib import Path
 
@@ -66,7 +65,7 @@ def sizes():
 
 
 def supports():
-    """Error by h at d = 4 spacings' support factor: the paper's problem 4.3."""
+    """Error by h at d = 4 on the paper's problem 4.3."""
     case = ALL["source"]
     cloud = case.cloud((9, 19))
     rows = []
@@ -96,23 +95,17 @@ def kernels():
 
 
 def methods():
-    """Error and seconds of the five methods."""
+    """Error of the five methods."""
     case = ALL["source"]
     rows = []
     for p in (2, 4):
         for method in ("I", "II", "III", "SSPH", "S"):
             cloud = case.cloud((33, 73))
             kernel = js.SuperGaussian(h=cloud.spacing, d=4.0) if method != "S" else None
-            error = attempt(case, cloud, method, p, kernel)  # compiles
-            seconds = []
-            for _ in range(3 if error is not None else 0):
-                start = time.perf_counter()
-                js.solve(case.problem(), cloud, method=method, order=p, kernel=kernel)
-                seconds.append(time.perf_counter() - start)
-            rows.append([method, p, show(error), f"{statistics.median(seconds):.2g}" if seconds else ""])
-    return table(["method", "order", "error", "seconds"], rows,
+            rows.append([method, p, show(attempt(case, cloud, method, p, kernel))])
+    return table(["method", "order", "error"], rows,
                  "Problem 4.3 on 33 x 73 particles with its Neumann side; the paper's kernel with h = Δ, d = 4, "
-                 "S with its defaults; warm, median of three.")  # fmt: skip
+                 "S with its defaults; relative L2 error.")  # fmt: skip
 
 
 def clouds():

@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-STYLE = {
-    "I": ("C0", "o"), "II": ("C1", "s"), "III": ("C2", "^"), "SSPH": ("C3", "x"), "S": ("C4", "d"), "S, seven": ("C4", "d"),
-}  # fmt: skip
+STYLE = {"I": ("C0", "o"), "II": ("C1", "s"), "III": ("C2", "^"), "SSPH": ("C3", "x"), "S": ("C4", "d")}
+STYLE["S, seven"] = STYLE["S"]
 
 
 def _panels(nodes: list[str], ylabel: str, xlabel: str) -> tuple[Figure, Any]:
@@ -67,16 +66,15 @@ def rates(data: dict[str, Any]) -> Figure:
 
 
 def nonsmooth(data: dict[str, Any]) -> Figure:
-    """Errors under nonsmooth sources, on the finer cloud of each."""
-    finest = [r for r in data["nonsmooth"] if r["particles"] in (81, 33)]
+    """Errors under nonsmooth sources."""
     figure = Figure(figsize=(12, 3.8), layout="constrained")
     for ax, order in zip(figure.subplots(1, 2), (2, 4)):
-        rows = [r for r in finest if r["order"] == order]
+        rows = [r for r in data["nonsmooth"] if r["order"] == order]
         for k, name in enumerate(("I", "II", "III", "SSPH", "S")):
             at = np.arange(len(rows)) + 0.16 * (k - 2)
             ax.bar(at, [r[name] for r in rows], 0.15, color=STYLE[name][0], label=name)
         ax.set_yscale("log")
-        ax.set_xticks(range(len(rows)), [r["source"] for r in rows])
+        ax.set_xticks(range(len(rows)), [r["source"].replace(", ", "\n").replace(" ", "\n", 1) for r in rows], fontsize=8)
         ax.set_title(f"order {order}")
     figure.axes[0].set_ylabel("relative L2 error, percent")
     figure.axes[0].legend(fontsize=8, ncols=5)

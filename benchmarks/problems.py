@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any
 
 import jax
@@ -78,6 +79,7 @@ class Case:
         return float(np.linalg.norm(np.asarray(sol.u) - exact) / np.linalg.norm(exact))
 
 
+@lru_cache(maxsize=256)
 def _mapped(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
     return jax.jit(jax.vmap(function))
 

@@ -78,15 +78,15 @@ WHY_RODS = {
     (4, "I"): _ROD_I,
     (5, "I"): _ROD_I,
     (6, "I"): "I: the paper has none at 5 nodes, where its system is singular; the closed method is exact there.",
-    (6, "SSPH"): "SSPH: six terms ask for six nodes; at 5 the paper has no answer, and what stands here has no meaning.",
+    (6, "SSPH"): "SSPH: six terms ask for six nodes; five have no answer.",
 }
 
 WHY_PLATE = {
     "I": "I: for Laplace's equation the printed rows leave Shepard's average u_i = sum(W u) / sum(W), the paper's "
     "numbers; closed in two stages the derivatives count, and the error is lower at every grid.",
-    "II": "II: how the paper sets the derivatives at the boundary is not said and could not be recovered; here they are "
-    "recovered from the values. With all seven free coefficients every grid is below the paper.",
+    "II": "II: how the paper sets the derivatives at the boundary is not said and cannot be told from its numbers; here "
+    "they are recovered from the values. With all seven free coefficients every grid is below the paper.",
     "III": "III: within 0.2 percent everywhere; the paper's 171-node entry is 0.004 too large in I and in III alike.",
-    "SSPH": "SSPH: 50 and 171 nodes agree to five digits, 629 does not at the stated settings: other settings there, or "
-    "a misprint.",
+    "SSPH": "SSPH: 50 and 171 nodes agree to the digits printed, 629 does not at the stated settings: other settings "
+    "there, or a misprint.",
 }

@@ -131,10 +131,7 @@ class Bench:
 
 def bench(setup: Setup, method: str) -> Bench:
     cloud = setup.cloud()
-    from scipy.spatial import cKDTree
-
-    near = cKDTree(cloud.points).query(cloud.points, k=2)[0][:, 1]
-    spacing = float(np.median(near))
+    spacing = cloud.spacing
     order = setup.orders[METHODS.index(method)]
     return Bench(setup, method, order, cloud, spacing, stencils=js.stencils(cloud, radius=REACH * spacing * 1.0001))
 

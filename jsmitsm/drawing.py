@@ -108,6 +108,18 @@ def floor(numbers: np.ndarray) -> float:
     return float(max(np.median(positive) * 1e-2, positive.max() * 1e-8, positive.min()))
 
 
+def tracks(name: str, values: Any, steps: int) -> dict[str, np.ndarray]:
+    """The arrays of one entry of a history, with one row per step, by their names."""
+    if isinstance(values, list):  # plain numbers, one per step, not a tree of them
+        values = np.asarray(values, dtype=float)
+    found: dict[str, np.ndarray] = {}
+    for path, leaf in jax.tree_util.tree_flatten_with_path(values)[0]:
+        array = np.asarray(leaf, dtype=float)
+        if array.ndim and len(array) == steps:
+            found[name + jax.tree_util.keystr(path)] = array
+    return found
+
+
 def neighbours(what: Stencils | Solution) -> np.ndarray:
     """Padded neighbours (N, w) of stencils, or those that a solution was made with."""
     if isinstance(what, Stencils):

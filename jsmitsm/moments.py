@@ -217,8 +217,8 @@ def functional(scheme: Scheme, near: Support, system: System, wanted: Any) -> tu
     """
     target = system.reduced.T @ wanted.T
     w = _fit(scheme, system.weight, system.phi, system.tests, target)
-    size = jnp.max(jnp.abs(target))
-    defect = jnp.max(jnp.abs(system.phi.T @ w - target)) / jnp.where(size > 0, size, 1.0)
+    size = jnp.max(jnp.abs(target), initial=0.0)
+    defect = jnp.max(jnp.abs(system.phi.T @ w - target), initial=0.0) / jnp.where(size > 0, size, 1.0)
     rest = wanted.T - system.values.T @ w
     v_own = system.own_solve.T @ (system.elimination.basis.T @ rest)
     v = system.elimination.particular.T @ (rest - system.own_rows.T @ v_own)

@@ -220,8 +220,8 @@ def tuning(result: Any, *, ax: Any = None) -> Any:
     """The history of a tuning: the objective and every parameter over the steps.
 
     ``result``: what :func:`jsmitsm.tune` returned, or its ``history``: a mapping from ``"objective"`` and the
-    parameters' names to one entry per step. A parameter with one number per particle is drawn as its median
-    and its range. Returns an array of axes, one per panel.
+    parameters' names to one entry per step, or a pytree of such. A parameter with one number per particle is
+    drawn as its median and its range. Returns an array of axes, one per panel.
 
     Examples
     --------
@@ -234,8 +234,9 @@ def tuning(result: Any, *, ax: Any = None) -> Any:
     if "objective" not in history:
         raise ValueError(f'history: has {list(history)} but no "objective"; pass what js.tune returned')
     panels = {"objective": np.asarray(history["objective"], dtype=float)}
-    panels |= {k: np.asarray(v, dtype=float) for k, v in history.items() if k != "objective"}
-    panels = {k: v for k, v in panels.items() if v.ndim >= 1 and len(v) == len(panels["objective"])}
+    for name, track in history.items():
+        if name != "objective":
+            panels |= drawing.tracks(name, track, len(panels["objective"]))
     axes = drawing.panels(ax, len(panels), (4.8, 1.7), rows=True)
     for k, (one, (name, track)) in enumerate(zip(axes, panels.items())):
         step, flat = np.arange(len(track)), track.reshape(len(track), -1)
@@ -243,7 +244,7 @@ def tuning(result: Any, *, ax: Any = None) -> Any:
             one.fill_between(step, flat.min(axis=1), flat.max(axis=1), color=COLOURS[k % 7], alpha=0.25, linewidth=0)
         one.plot(step, np.median(flat, axis=1), ".-", color=COLOURS[k % 7])
         if name == "objective":
-            if (track > 0).all():
+            if (track[np.isfinite(track)] > 0).all():
                 one.set_yscale("log")
             best = int(np.nanargmin(track))
             one.plot(best, track[best], "o", color="k", markersize=7, fillstyle="none")

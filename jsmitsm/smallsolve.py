@@ -63,6 +63,8 @@ def _inverse_lower(lower: Any) -> Any:
 def general_inverse(matrix: Any) -> Any:
     """The inverse of a small square matrix: Gauss-Jordan with row pivoting in plain jnp."""
     n = matrix.shape[0]
+    if not n:
+        return matrix
     work = jnp.concatenate([matrix, jnp.eye(n, dtype=matrix.dtype)], axis=1)
 
     def step(k, work):
@@ -86,6 +88,8 @@ def _general_inverse_jvp(primals, tangents):
 def gram_inverse(a: Any, tolerance: float | None = None) -> Any:
     """(A^T A)^-1 for a tall A (n, k) by symmetric sweeps; with a tolerance, columns that depend
     on others up to it are left out (zero rows and columns)."""
+    if not a.shape[1]:  # conditions may leave nothing free
+        return jnp.zeros((0, 0), a.dtype)
     size = jnp.sqrt(jnp.sum(a**2, axis=0))
     scale = 1.0 / jnp.where(size > 0, size, 1.0)
     gram = (a * scale).T @ (a * scale)

@@ -43,6 +43,8 @@ PATIENCE = 12
 GAIN = 0.005
 RETREATS = 8
 SUPPORT = True
+# A kernel must stand a support wider and narrower by this part.
+SHAKE = 0.02
 
 
 @dataclass
@@ -347,6 +349,21 @@ class _Scene:
         return score, (value, largest, defect, found._values)
 
 
+    def shaken(self, kernel: Kernel, bound: float) -> np.ndarray:
+        """The particles (N,) bool that a slightly wider or narrower support leaves weak."""
+        weak = np.zeros(len(self.cloud), bool)
+        if self.numbers is None:
+            return weak
+        # A smaller h narrows weights and support, a larger d widens the support alone.
+        for other in (kernel.replace(h=kernel.h * (1.0 - SHAKE)), kernel.replace(d=kernel.d * (1.0 + SHAKE))):
+            near = replace(self.disc, kernel=other)
+            classes, rows = dz.all_rows(near, self.numbers)
+            for cls, row in zip(classes, rows):
+                bad = ~(np.asarray(row.defect) < DEFECT) | ~(np.asarray(row.lebesgue).max(axis=1) <= bound)
+                weak[cls.ids[bad]] = True
+        return weak
+
+
 def hand_kernel(points: np.ndarray) -> Kernel:
     """The paper's choice, h = spacing and d = 4; one h per particle where the spacing varies."""
     spacing = nearest_distance(points)
@@ -399,7 +416,7 @@ class _Search:
                     scene.messages.append(f"Stopped after {retreats} steps back.")
                     break
                 continue
-            z, point = new, trial
+            z, point, part = new, trial, min(1.0, 1.5 * part)
             if self._accept(point):
                 last = step
             bar.set_postfix_str(f"objective {self.best.objective:.3g}")
@@ -470,6 +487,11 @@ class _Search:
         if not np.isfinite(float(score)) or not np.isfinite(_largest(slope)):
             return None, f"the objective is {float(value)} or has no finite gradient"
         point = _Point(z, kernel, float(score), float(value), float(lebesgue), slope, np.asarray(values))
+        if self.best is not None and point.score < self.best.score:
+            weak = scene.shaken(kernel, max(scene.bound, 1.1 * point.lebesgue))
+            if weak.any():
+                scene.undetermined |= weak
+                return None, f"a slightly different support would fail at {weak.sum()} particle(s)"
         if not scene.linear:
             scene.values = point.values
         self.points.append(point)

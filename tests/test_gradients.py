@@ -114,20 +114,20 @@ def test_every_derivative_in_1d(line, method, solver):
     check_every_derivative(line, method, solver)
 
 
-@pytest.mark.parametrize("method", ["III", "S"])
-def test_every_derivative_in_2d(plane, method):
-    check_every_derivative(plane, method, "sparse")
+def test_every_derivative_in_2d(plane):
+    """With a Neumann side besides; one method, for the formulas of the others are the same in 1D."""
+    check_every_derivative(plane, "S", "sparse")
 
 
 def test_dense_and_sparse_gradients_agree(line):
     """The same adjoint by two factorisations: round-off times a condition number below 1e3."""
-    dense, sparse = (jax.grad(lambda t, s=s: line.objective(t, "S", s))(line.theta) for s in ("dense", "sparse"))
+    dense, sparse = (jax.grad(line.objective)(line.theta, "S", solver) for solver in ("dense", "sparse"))
     for name in line.names:
         scale = np.abs(dense[name]).max()
         assert np.abs(np.asarray(dense[name]) - np.asarray(sparse[name])).max() < 1e-10 * scale, name
 
 
-@pytest.mark.parametrize("name", ["h", "points", "wall", "diffusion"])
+@pytest.mark.parametrize("name", ["points", "wall"])
 def test_forward_mode_agrees_with_reverse_mode(line, name):
     def f(value):
         return line.objective({**line.theta, name: value})

@@ -151,6 +151,10 @@ def test_tuning_history():
     assert [ax.get_ylabel() for ax in axes] == ["objective", "h", "d"]
     assert axes[0].get_title(loc="right") == "best 1 at step 1"
     assert axes[2].lines[0].get_ydata().tolist() == [4.5, 4.0, 3.5]
+    history |= {"params": {"a": np.ones(3), "b": np.ones((3, 2))}, "objective": [3.0, np.nan, 2.0]}
+    axes = plot.tuning(history)
+    assert [ax.get_ylabel() for ax in axes[3:]] == ["params['a']", "params['b']"]
+    assert axes[0].get_title(loc="right") == "best 2 at step 2"
     steps = [{"objective": 1.0, "h": 0.1}, {"objective": 0.5, "h": 0.2}]
     assert len(plot.tuning(steps)) == 2
 
