@@ -321,7 +321,7 @@ def print_sweeps(found: dict[str, Any]) -> dict[str, Any]:
         errors = [found[nodes][m]["d"]["4.0"] for nodes in found]
         rows.append([m, *(f"{rate(found[nodes][m]['h']):.2f}" for nodes in found),
                      *(f"{math.log2(a / b):.2f}" for a, b in zip(errors, errors[1:]))])  # fmt: skip
-    note = "Slope of log error against log h, h = 0.8 to 1.2, on one cloud; and the order from cloud to cloud, h = spacing"
+    note = "Slope of log error against log h, 0.8 to 1.2, on one cloud; and the order from cloud to cloud, h = spacing"
     made["paper-rates"] = table(["method", *(f"{n} nodes" for n in found), "50 to 171", "171 to 629"], rows, note)
     printed("Figures 13 to 15", made["paper-rates"])
     return made
@@ -384,22 +384,23 @@ def print_nonsmooth(found: list[dict[str, Any]]) -> dict[str, Any]:
     """Print the errors under nonsmooth sources and what they say of the paper's claim."""
     rows = [[r["source"], r["order"], *(shown(r[m]) for m in METHODS), f"{r['ratio']:.2f}"] for r in found]
     note = (
-        "Sources with a kink, a jump or a peak, 41 particles on [0, 1] and 25 x 25 on its square, h = spacing, d = 4: error in "
-        "percent, root mean square over shifted singularities; last column SSPH / best of I, II and III"
+        "Sources with a kink, a jump or a peak, 41 particles on [0, 1] and 25 x 25 on its square, h = spacing, d = 4: "
+        "error in percent, root mean square over shifted singularities; last column SSPH / best of I, II and III"
     )
     made = table(["source", "order", *METHODS, "SSPH / SMITSM"], rows, note)
     remarks = []
     for order, why in (
         (2, "At order 2 the recursion takes of f what SSPH takes, its value at the particle."),
-        (4, "At order 4 the recursion takes the derivatives of f at the particle for those of its whole support, which a "
-            "kink, a jump or an unresolved peak belies; SSPH never differentiates f."),
+        (4, "At order 4 the recursion takes the derivatives of f at the particle for those of its whole support, which "
+            "a kink, a jump or an unresolved peak belies; SSPH never differentiates f."),
     ):  # fmt: skip
         rough = [r["ratio"] for r in found if r["order"] == order and not r["source"].startswith("smooth")]
         smooth = [r["ratio"] for r in found if r["order"] == order and r["source"].startswith("smooth")]
+        ahead, behind = sum(x > 1.02 for x in rough), sum(x < 0.98 for x in rough)
         remarks.append(
-            f"order {order}: SMITSM ahead of SSPH (by more than 2 percent) under {sum(x > 1.02 for x in rough)} of {len(rough)} "
-            f"nonsmooth sources, behind under {sum(x < 0.98 for x in rough)}; ratios {min(rough):.2g} to {max(rough):.2g}, "
-            f"under smooth ones {min(smooth):.2g} to {max(smooth):.2g}. {why}"
+            f"order {order}: SMITSM ahead of SSPH (by more than 2 percent) under {ahead} of {len(rough)} nonsmooth sources, "
+            f"behind under {behind}; ratios {min(rough):.2g} to {max(rough):.2g}, under smooth ones {min(smooth):.2g} to "
+            f"{max(smooth):.2g}. {why}"
         )
     printed("Is SMITSM ahead under nonsmooth sources?", made, remarks)
     return made
@@ -416,7 +417,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     start = time.perf_counter()
     where = machine.describe()
     print(f"{where['processor']}, {where['cores']} cores, jax {where['jax']}")
-    print("First calls include compilation and are made two at a time where there are two cores; repeats one at a time.")
+    print("First calls compile and are made two at a time where there are two cores; repeats one at a time.")
     rods, plate = rod_tables(), plate_table()
     tables = print_tables(rods, plate)
     if quick:

@@ -74,7 +74,7 @@ def nonsmooth(data: dict[str, Any]) -> Figure:
             at = np.arange(len(rows)) + 0.16 * (k - 2)
             ax.bar(at, [r[name] for r in rows], 0.15, color=STYLE[name][0], label=name)
         ax.set_yscale("log")
-        ax.set_xticks(range(len(rows)), [r["source"].replace(", ", "\n").replace(" ", "\n", 1) for r in rows], fontsize=8)
+        ax.set_xticks(range(len(rows)), ["\n".join(r["source"].replace(",", "").split()) for r in rows], fontsize=8)
         ax.set_title(f"order {order}")
     figure.axes[0].set_ylabel("relative L2 error, percent")
     figure.axes[0].legend(fontsize=8, ncols=5)

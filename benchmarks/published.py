@@ -84,8 +84,8 @@ WHY_RODS = {
 WHY_PLATE = {
     "I": "I: for Laplace's equation the printed rows leave Shepard's average u_i = sum(W u) / sum(W), the paper's "
     "numbers; closed in two stages the derivatives count, and the error is lower at every grid.",
-    "II": "II: how the paper sets the derivatives at the boundary is not said and cannot be told from its numbers; here "
-    "they are recovered from the values. With all seven free coefficients every grid is below the paper.",
+    "II": "II: how the paper sets the derivatives at the boundary is not said and cannot be told from its numbers; "
+    "here they are recovered from the values. With all seven free coefficients every grid is below the paper.",
     "III": "III: within 0.2 percent everywhere; the paper's 171-node entry is 0.004 too large in I and in III alike.",
     "SSPH": "SSPH: 50 and 171 nodes agree to the digits printed, 629 does not at the stated settings: other settings "
     "there, or a misprint.",

@@ -61,7 +61,7 @@ def right_side(disc: Discretization, nums: Numbers, classes: list[Class], rows: 
     unknown = disc.unknowns
     parts, places = [], []
     for cls, row in zip(classes, rows):
-        xp = jnp if is_traced(nums, row, cls.neighbours) else np
+        xp = jnp if is_traced(nums.source, nums.given, nums.held, nums.gamma, row, cls.neighbours) else np
         source, given = right_sides(disc, nums, cls)
         w, v, v_own = (xp.asarray(x) for x in (row.weights, row.source, row.condition))
         index = xp.maximum(disc.images.owners(cls.neighbours), 0)

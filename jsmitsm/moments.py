@@ -16,7 +16,7 @@ import numpy as np
 from jsmitsm.kernels import EDGE, Gaussian, Kernel
 from jsmitsm.polynomials import functionals, monomials, whitening
 from jsmitsm.recursion import Recursion, Slot, constraints, substitution
-from jsmitsm.smallsolve import general_inverse, gram_inverse, min_norm, null_space, solve_gram
+from jsmitsm.smallsolve import general_inverse, gram_inverse, min_norm, null_space, safe_root, solve_gram
 from jsmitsm.taylor import multi_indices
 
 
@@ -152,7 +152,7 @@ def _all_free(scheme: Scheme) -> np.ndarray:
 def _fit(scheme: Scheme, weight: Any, phi: Any, tests: Any, target: Any) -> Any:
     """Weights w (n, m) on the data with phi^T w = target, in the method's test space."""
     if tests is None:
-        root = jnp.sqrt(weight)[:, None]
+        root = safe_root(weight)[:, None]
         tolerance = 1e-13 if scheme.method == "SSPH" else None
         return root * min_norm(root * phi, target, tolerance)
     return tests @ (general_inverse(phi.T @ tests) @ target)
@@ -282,7 +282,7 @@ def block(scheme: Scheme, near: Support, solution: Elimination, own: Any, data: 
     """The least-squares misfit of the particle's local fit as a quadratic form of its data."""
     system = local_system(scheme, near, solution, own, data, None, skip_self=False)
     part = particular_part(scheme, solution, system, source, given)
-    root = jnp.sqrt(system.weight)
+    root = safe_root(system.weight)
     a = root[:, None] * system.phi
     misfit = jnp.diag(system.weight) - root[:, None] * (a @ solve_gram(a, gram_inverse(a), a.T)) * root
     # Physical data are scaled like the unknowns inside the fit.
@@ -320,9 +320,9 @@ def coefficients(
     part = particular_part(scheme, solution, system, source, given)
     rest = scaled - system.values @ part
     if system.tests is None:
-        a = jnp.sqrt(system.weight)[:, None] * system.phi
+        a = safe_root(system.weight)[:, None] * system.phi
         inverse = gram_inverse(a, 1e-13 if collocated else None)
-        free = solve_gram(a, inverse, a.T @ (jnp.sqrt(system.weight) * rest))
+        free = solve_gram(a, inverse, a.T @ (safe_root(system.weight) * rest))
     else:
         free = general_inverse(system.tests.T @ system.phi) @ (system.tests.T @ rest)
     scaled_u = (part + system.reduced @ free).reshape(fields, rec.size)

@@ -12,6 +12,11 @@ import jax
 import jax.numpy as jnp
 
 
+def safe_root(x: Any) -> Any:
+    """The square root of x >= 0, with derivative zero at zero: a weight of zero stays one."""
+    return jnp.where(x > 0, jnp.sqrt(jnp.where(x > 0, x, 1.0)), 0.0)
+
+
 @jax.custom_jvp
 def null_space(matrix: Any) -> tuple[Any, Any]:
     """Orthonormal basis Z of the null space of C (r, k), and the pseudo-inverse Q of C (full rank).

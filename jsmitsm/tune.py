@@ -391,29 +391,29 @@ class _Search:
         self.optimizer = _adam(steps) if optimizer is None else optimizer
         self.points: list[_Point] = []
         self.best: _Point | None = None
+        self.retreats: list[tuple[int, str]] = []
+        free = scene.given is None
+        self.highest = np.full(len(scene.cloud), np.inf) if free else np.asarray(scene.given.radius)
 
     def run(self, bar: Any) -> None:
         scene, space = self.scene, self.space
         lowest, z, point = self._start()
-        highest = np.full(lowest.shape, np.inf) if scene.given is None else np.asarray(scene.given.radius)
-        state, part, retreats, last = self._fresh(z), 1.0, 0, 0
+        state, part, last = self.optimizer.init(z), 1.0, 0
         for step in range(1, self.steps + 1):
             move, state = self._update(point, state)
             move = jax.tree.map(lambda x, p=part: p * jnp.clip(x, -STRIDE, STRIDE), move)
-            new = space.raised(jax.tree.map(jnp.add, z, move), lowest, highest)
+            new = space.raised(jax.tree.map(jnp.add, z, move), lowest, self.highest)
             if _largest(jax.tree.map(jnp.subtract, new, z)) < 1e-5:
                 scene.messages.append(f"Step {step}: nothing moves any more.")
                 break
             trial, reason = self._tried(new)
             bar.update(1)
             if trial is None:
-                retreats += 1
+                self.retreats.append((step, reason))
                 part, point, z = part / 2.0, self.best, self.best.z
-                state = self._fresh(z)
-                scene.messages.append(f"Step {step}: {reason}; back to the best kernel, with half the step.")
+                state = self.optimizer.init(z)
                 lowest = self._floor(lowest, new)
-                if retreats == RETREATS:
-                    scene.messages.append(f"Stopped after {retreats} steps back.")
+                if len(self.retreats) == RETREATS:
                     break
                 continue
             z, point, part = new, trial, min(1.0, 1.5 * part)
@@ -423,6 +423,15 @@ class _Search:
             if step - last >= PATIENCE:
                 break
         bar.close()
+        self._tell_retreats()
+
+    def _tell_retreats(self) -> None:
+        """The steps back, by their reasons."""
+        for reason in dict.fromkeys(r for _, r in self.retreats):
+            at = ", ".join(str(step) for step, r in self.retreats if r == reason)
+            self.scene.messages.append(f"Back to the best kernel with half the step, at step {at}: {reason}.")
+        if len(self.retreats) == RETREATS:
+            self.scene.messages.append(f"Stopped after {RETREATS} steps back.")
 
     def _floor(self, lowest: np.ndarray, failed: Any) -> np.ndarray:
         """The smallest supports admitted, raised half way from those that failed to the best ones."""
@@ -437,10 +446,12 @@ class _Search:
         lowest, z = scene.smallest_support(), space.zero()
         scene.bound = self._bound()
         point, reason = self._tried(z)
+        if point is None and scene.reference is None and reason.startswith("the objective is"):
+            raise ValueError(f"objective: it is {reason.split()[-1]} at the start; return a finite scalar there")
         widen = 1.0
         while point is None and widen < 3.0 and ("h" in z or "d" in z):
-            z, widen = space.raised(z, lowest * widen * 1.01, np.full(lowest.shape, np.inf)), widen * 1.2
-            point, again = self._tried(z)
+            z, widen = space.raised(z, np.minimum(lowest * widen * 1.01, self.highest), self.highest), widen * 1.2
+            point, _ = self._tried(z)
             if point is not None:
                 scene.messages.append(f"The starting kernel fails ({reason}); started from {point.kernel!r}.")
         if point is None:
@@ -483,15 +494,16 @@ class _Search:
         bad = ~(np.asarray(defect) < DEFECT)
         if bad.any():
             scene.undetermined[np.concatenate([c.ids for c in scene.disc.classes])[bad]] = True
-            return None, f"the support does not determine the solution at {bad.sum()} particle(s)"
+            return None, "the support does not determine the solution everywhere"
         if not np.isfinite(float(score)) or not np.isfinite(_largest(slope)):
-            return None, f"the objective is {float(value)} or has no finite gradient"
+            what = "the objective's gradient" if np.isfinite(float(score)) else "the objective"
+            return None, f"{what} is {float(value) if what == 'the objective' else 'not finite'}"
         point = _Point(z, kernel, float(score), float(value), float(lebesgue), slope, np.asarray(values))
         if self.best is not None and point.score < self.best.score:
             weak = scene.shaken(kernel, max(scene.bound, 1.1 * point.lebesgue))
             if weak.any():
                 scene.undetermined |= weak
-                return None, f"a slightly different support would fail at {weak.sum()} particle(s)"
+                return None, "a slightly different support would not do"
         if not scene.linear:
             scene.values = point.values
         self.points.append(point)
@@ -508,9 +520,6 @@ class _Search:
         size = 1.0 if self.scene.reference is not None else abs(best.score)
         self.best = point
         return best.score - point.score > GAIN * size
-
-    def _fresh(self, z: Any) -> Any:
-        return self.optimizer.init(z)
 
     def _update(self, point: _Point, state: Any) -> tuple[Any, Any]:
         import optax
