@@ -98,7 +98,7 @@ def run(job: Job) -> Result:
     try:
         sol = solve()
         u = np.asarray(sol.u)
-    except js.SolveError as fault:
+    except (js.SolveError, ValueError) as fault:
         return Result(None, time.perf_counter() - start, said=str(fault))
     seconds = time.perf_counter() - start
     return Result(100 * job.case.error(sol), seconds, u)

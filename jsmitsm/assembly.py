@@ -75,7 +75,8 @@ def _in_size_classes(function: Any) -> Any:
             scheme, cloud_wide(points), cloud_wide(kernel), class_wide(ids), class_wide(neighbours), given,
             class_wide(each), cloud_wide(whole),
         )  # fmt: skip
-        return jax.tree.map(lambda x: x[:m], made)
+        # Cut on the host where nothing is traced: an eager slice would compile for every length.
+        return jax.tree.map(lambda x: (x if isinstance(x, jax.core.Tracer) else np.asarray(x))[:m], made)
 
     return padded
 

@@ -50,7 +50,7 @@ def test_the_cache_block_names_real_options():
 
     (block,) = [b for b in blocks(README) if "jax_compilation_cache_dir" in b]
     for name in re.findall(r'update\("(\w+)"', block):
-        jax.config.read(name)
+        assert hasattr(jax.config, name)
 
 
 @pytest.mark.parametrize("mark, needed", [("paper", "-m benchmarks.paper"), ("tests", "-m pytest")])
@@ -66,7 +66,7 @@ def test_the_two_commands_are_there(mark, needed):
 
 def test_files_and_pictures_linked_exist():
     for page in (ROOT / "README.md", *(ROOT / "docs").glob("*.md")):
-        for target in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", page.read_text()):
+        for target in re.findall(r"\]\(([^)#:$\\]+\.\w+)(?:#[^)]*)?\)", page.read_text()):
             assert (page.parent / target).exists(), f"{page.name} links to {target}"
 
 
