@@ -54,7 +54,7 @@ def from_mesh(mesh: Any, tags: str | None = None) -> Cloud:
     >>> mesh = meshio.Mesh(corners, [("triangle", [[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]]),
     ...                              ("line", [[0, 1], [1, 2]])], cell_data={"gmsh:physical": [[7] * 4, [1, 2]]},
     ...                    field_data={"bottom": np.array([1, 1]), "side": np.array([2, 1])})
-    >>> js.from_mesh(mesh)
+    >>> js.files.from_mesh(mesh)
     Cloud(5 particles in 2D, groups {interior: 1, bottom: 2, side: 1, boundary: 1})
     """
     if isinstance(mesh, (str, os.PathLike)):
@@ -98,7 +98,7 @@ def from_shapely(polygon: Any, spacing: Any, seed: int = 0, groups: Any = None) 
     Raises ValueError for other geometries; the parts of a ``MultiPolygon`` are solved one by one.
 
     >>> import shapely, jsmitsm as js
-    >>> sorted(js.from_shapely(shapely.box(0, 0, 2, 1).difference(shapely.Point(1, 0.5).buffer(0.2)), 0.1).groups)
+    >>> sorted(js.files.from_shapely(shapely.box(0, 0, 2, 1).difference(shapely.Point(1, 0.5).buffer(0.2)), 0.1).groups)
     ['boundary', 'hole0', 'interior']
     """
     if isinstance(polygon, str):
@@ -155,7 +155,7 @@ def to_mesh(sol: Solution, **more: Any) -> Any:
     >>> import jsmitsm as js
     >>> ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(1.0)}
     >>> sol = js.solve(js.Problem(lambda u, x: js.laplacian(u)(x), ends), js.interval(0.0, 1.0, 9))
-    >>> js.to_mesh(sol).point_data["u"].shape
+    >>> js.files.to_mesh(sol).point_data["u"].shape
     (9,)
     """
     meshio = _needed("meshio", "mesh")
@@ -176,7 +176,7 @@ def to_pandas(what: Cloud | Solution, **more: Any) -> Any:
     Needs pandas: ``pip install "jsmitsm[tables]"``.
 
     >>> import jsmitsm as js
-    >>> js.to_pandas(js.interval(0.0, 1.0, 3)).group.tolist()
+    >>> js.files.to_pandas(js.interval(0.0, 1.0, 3)).group.tolist()
     ['left', 'interior', 'right']
     """
     return _needed("pandas", "tables").DataFrame({**_columns(what), **more})

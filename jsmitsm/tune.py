@@ -1,3 +1,4 @@
+# mypy: ignore-errors
 """Choose a kernel's parameters by gradient descent, without knowing the exact solution.
 
 The objective "estimate" is the distance to one reference solution of higher order, computed once,
