@@ -21,7 +21,7 @@ __version__ = "0.1.0"
 
 # Imported when first used: they need more than solving does.
 _LAZY = {"plot": "jsmitsm.plot", "files": "jsmitsm.files"}
-_LAZY_NAMES = {"tune": "jsmitsm.tune", "TuneResult": "jsmitsm.tune", "show_versions": "jsmitsm.versions"}
+_LAZY_NAMES = {"tune": "jsmitsm.tuning", "TuneResult": "jsmitsm.tuning", "show_versions": "jsmitsm.versions"}
 
 
 def __getattr__(name: str) -> Any:

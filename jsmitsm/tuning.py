@@ -23,12 +23,13 @@ from jsmitsm.clouds import Cloud
 from jsmitsm.errors import SolveError
 from jsmitsm.health import DEFECT, LEBESGUE
 from jsmitsm.kernels import EDGE, Kernel, SuperGaussian
-from jsmitsm.neighbours import Stencils, nearest, within
+from jsmitsm.neighbours import Stencils, nearest
 from jsmitsm.newton import newton
 from jsmitsm.problem import Problem
 from jsmitsm.solution import Recipe, Solution
 from jsmitsm.solve import Fit, _check, solve
 from jsmitsm.system import Run
+from jsmitsm.taylor import multi_indices
 
 OPTIONS = ("method", "order", "stencils", "basis_terms", "formulation", "solver", "u0", "throw")
 # Adam's step on the logarithms; it decays to a tenth.
@@ -43,7 +44,10 @@ STRIDE = 0.5
 PATIENCE = 12
 GAIN = 0.005
 RETREATS = 8
-SUPPORT = True
+# Logarithms of parameters stay within this of the start: no optimizer may overflow them.
+FAR = 20.0
+# In place of a Lebesgue bound while there is none; finite, for the sake of derivatives.
+UNBOUNDED = 1e300
 # A kernel must stand a support wider and narrower by this part.
 SHAKE = 0.02
 
@@ -158,7 +162,7 @@ class _Space:
             self.start = kernel.replace(h=np.broadcast_to(np.asarray(kernel.h, float), groups.shape))
         leaves, self.shape = jax.tree.flatten(kernel.params)
         # A scalar h moves at a fixed support d h: the support has a lower bound, and the search slides along it.
-        self.by_support = {"h", "d"} <= set(names) and not np.ndim(self.start.h) and SUPPORT
+        self.by_support = {"h", "d"} <= set(names) and not np.ndim(self.start.h)
         self.moving = [np.asarray(x).dtype.kind == "f" for x in leaves]
 
     def zero(self) -> dict[str, Any]:
@@ -258,11 +262,11 @@ class _Scene:
         self.solves = 0
         self.values: Any = options.get("u0")
         self.pattern: Stencils | None = None
-        self.fit_pattern(kernel, 1.0)
+        self.fit_pattern(kernel)
         self.linear = self.disc.linear
-        self.bound = np.inf
+        self.bound = UNBOUNDED
         self.undetermined = np.zeros(len(cloud), bool)
-        self.scale = 1.0
+        self.scale, self.rowless = 1.0, False
         self.objective = objective
         self.reference = self._reference() if objective == "estimate" else None
 
@@ -271,7 +275,7 @@ class _Scene:
     def support(self, kernel: Kernel) -> np.ndarray:
         return np.broadcast_to(np.asarray(kernel.h) * np.asarray(kernel.d), (len(self.cloud),))
 
-    def fit_pattern(self, kernel: Kernel, margin: float = MARGIN) -> None:
+    def fit_pattern(self, kernel: Kernel) -> None:
         """Find neighbours for the kernel's support, unless the pattern still covers it."""
         support = self.support(kernel)
         if self.pattern is not None and (support <= np.asarray(self.pattern.radius) * EDGE).all():
@@ -279,19 +283,46 @@ class _Scene:
         radius = support * MARGIN
         if self.pattern is not None:
             radius = np.maximum(radius, np.asarray(self.pattern.radius))
-        self.pattern = self.given or within(self.points, radius)
-        o = self.options
-        self.disc = dz.discretize(
-            self.problem, self.cloud, o["method"], o["order"], kernel, self.pattern, o.get("basis_terms")
-        )
+        self.disc = self.discretized(kernel, radius)
+        self.pattern = self.disc.stencils
         self.numbers = dz.numbers(self.disc, self.problem) if self.disc.linear else None
 
+    def discretized(self, kernel: Kernel, radius: np.ndarray) -> dz.Discretization:
+        """The problem on a pattern of this radius (N,), or a wider one where it holds too few particles."""
+        o = self.options
+        if o["method"] in ("I", "II"):  # their first stage may look farther than the support
+            radius = np.maximum(radius, self._recovery_reach(o))
+        attempts = 1 if self.given is not None else 8
+        for k in range(attempts):
+            reach = radius * 1.3**k if self.given is None else np.asarray(self.given.radius)
+            wide = kernel.replace(h=reach / np.asarray(kernel.d))
+            try:
+                disc = dz.discretize(
+                    self.problem, self.cloud, o["method"], o["order"], wide, self.given, o.get("basis_terms")
+                )
+                break
+            except ValueError as error:
+                if k == attempts - 1 or "too few neighbours" not in str(error):
+                    raise
+        return replace(disc, kernel=kernel, given_stencils=True)
+
+    def _recovery_reach(self, o: dict[str, Any]) -> np.ndarray:
+        """What covers 1.5 times as many particles as there are Taylor coefficients, generously."""
+        size = len(multi_indices(self.cloud.dim, o["order"]))
+        return nearest(self.points, min(len(self.points), 3 * size // 2 + 1)).radius / 0.85
+
     def smallest_support(self) -> np.ndarray:
-        """The support (N,) that holds as many particles as the particle's fit has coefficients."""
-        scheme = self.disc.scheme
-        count = dz.scheme_size(scheme) + (scheme.method != "SSPH")
-        radius = nearest(self.points, min(count, len(self.points))).radius
-        return np.where(self.disc.held.all(axis=1), 0.0, radius)
+        """The support (N,) that holds as many particles as the particle's fit needs."""
+        from scipy.spatial import cKDTree
+
+        disc, method = self.disc, self.options["method"]
+        needed = np.full(len(self.cloud), 2 if method in ("I", "II") else dz.scheme_size(disc.scheme))
+        needed = np.maximum(needed - disc.n_own // disc.rec.fields, 1) + (method != "SSPH")
+        points = disc.images.searched(self.points)
+        most = min(int(needed.max()), len(points))
+        distance = cKDTree(points).query(self.points, k=range(1, most + 1))[0]
+        reach = distance[np.arange(len(needed)), np.minimum(needed, most) - 1]
+        return np.where(disc.held.all(axis=1), 0.0, reach)
 
     # -- the score
 
@@ -326,6 +357,7 @@ class _Scene:
         recipe = Recipe(o["method"], o["order"], o.get("basis_terms"), run.formulation, self.problem.fields)
         fit = Fit(self.problem, self.cloud, kernel, dz.table(disc), taylor, recipe)
         found = Solution(values, self.cloud, recipe, fit, good, iterations, {})
+        self.rowless = run.seen is None
         if run.seen is None:  # the least-squares form has no rows
             return found, jnp.ones(1), jnp.zeros(1)
         return found, *run.seen
@@ -349,11 +381,10 @@ class _Scene:
         score = score + PENALTY * (jnp.sum(above) if jnp.ndim(kernel.h) else jnp.max(above))
         return score, (value, largest, defect, found._values)
 
-
     def shaken(self, kernel: Kernel, bound: float) -> np.ndarray:
         """The particles (N,) bool that a slightly wider or narrower support leaves weak."""
         weak = np.zeros(len(self.cloud), bool)
-        if self.numbers is None:
+        if self.numbers is None or self.rowless:
             return weak
         # A smaller h narrows weights and support, a larger d widens the support alone.
         for other in (kernel.replace(h=kernel.h * (1.0 - SHAKE)), kernel.replace(d=kernel.d * (1.0 + SHAKE))):
@@ -373,7 +404,7 @@ def hand_kernel(points: np.ndarray) -> Kernel:
 
 
 def nearest_distance(points: np.ndarray) -> np.ndarray:
-    """Every particle's spacing (N,): the mean distance of its 2 D nearest neighbours, at least."""
+    """Every particle's spacing (N,): the mean distance of its D nearest neighbours."""
     from scipy.spatial import cKDTree
 
     dim = points.shape[1]
@@ -402,8 +433,9 @@ class _Search:
         state, part, last = self.optimizer.init(z), 1.0, 0
         for step in range(1, self.steps + 1):
             move, state = self._update(point, state)
-            move = jax.tree.map(lambda x, p=part: p * jnp.clip(x, -STRIDE, STRIDE), move)
-            new = space.raised(jax.tree.map(jnp.add, z, move), lowest, self.highest)
+            move = jax.tree.map(lambda x, p=part: p * jnp.clip(jnp.nan_to_num(x), -STRIDE, STRIDE), move)
+            new = jax.tree.map(lambda x, y: jnp.clip(x + y, -FAR, FAR), z, move)
+            new = space.raised(new, lowest, self.highest)
             if _largest(jax.tree.map(jnp.subtract, new, z)) < 1e-5:
                 scene.messages.append(f"Step {step}: nothing moves any more.")
                 break
@@ -444,31 +476,36 @@ class _Search:
     def _start(self) -> tuple[np.ndarray, Any, _Point]:
         """The first point: the user's kernel, or a wider one where that does not determine the solution."""
         scene, space = self.scene, self.space
-        lowest, z = scene.smallest_support(), space.zero()
+        lowest, start = scene.smallest_support(), space.zero()
         scene.bound = self._bound()
-        point, reason = self._tried(z)
-        if point is None and scene.reference is None and reason.startswith("the objective is"):
-            raise ValueError(f"objective: it is {reason.split()[-1]} at the start; return a finite scalar there")
+        z, reason = space.raised(start, np.minimum(lowest, self.highest), self.highest), "too few neighbours"
+        raised = _largest(jax.tree.map(jnp.subtract, z, start)) > 1e-9
+        z = z if raised else start
+        point, why = self._tried(z)
+        if point is None and scene.reference is None and why.startswith("the objective is"):
+            raise ValueError(f"objective: it is {why.split()[-1]} at the start; return a finite scalar there")
+        reason = reason if raised else why
         widen = 1.0
         while point is None and widen < 3.0 and ("h" in z or "d" in z):
-            z, widen = space.raised(z, np.minimum(lowest * widen * 1.01, self.highest), self.highest), widen * 1.2
+            z, raised = space.raised(z, np.minimum(lowest * widen * 1.01, self.highest), self.highest), True
             point, _ = self._tried(z)
-            if point is not None:
-                scene.messages.append(f"The starting kernel fails ({reason}); started from {point.kernel!r}.")
+            widen *= 1.2
         if point is None:
             raise SolveError(f"kernel: tuning cannot start from {space.start!r}: {reason}; start from a wider support")
-        if not np.isfinite(scene.bound):
+        if raised:
+            scene.messages.append(f"The starting kernel fails ({reason}); started from {point.kernel!r}.")
+        if scene.bound == UNBOUNDED:
             scene.bound = max(LEBESGUE, point.lebesgue)
         if scene.reference is None and point.objective:
             scene.scale = abs(point.objective)
             self.points.clear()
-            point, reason = self._tried(z)
+            point, _ = self._tried(z)
             assert point is not None
         self._accept(point)
-        return np.minimum(lowest, scene.support(point.kernel)), z, point
+        return np.minimum(lowest, self.highest), z, point
 
     def _bound(self) -> float:
-        """The Lebesgue bound of the paper's choice; infinite where that fails."""
+        """The Lebesgue bound of the paper's choice; none where that fails."""
         scene = self.scene
         o = {k: v for k, v in scene.options.items() if k not in ("stencils", "throw")}
         hand = hand_kernel(scene.points)
@@ -476,7 +513,7 @@ class _Search:
         try:
             usual = solve(scene.problem, scene.cloud, kernel=hand, **o).stats.get("lebesgue_max", 1.0)
         except (ValueError, SolveError):
-            return np.inf
+            return UNBOUNDED
         return max(LEBESGUE, usual)
 
     def _tried(self, z: Any) -> tuple[_Point | None, str]:
@@ -550,7 +587,7 @@ def _adam(steps: int) -> Any:
 
 def _concrete(kernel: Kernel) -> Kernel:
     """The kernel with numpy leaves: scalars as floats."""
-    return jax.tree.map(lambda x: float(x) if np.ndim(x) == 0 else np.asarray(x), kernel)
+    return jax.tree.map(lambda x: np.asarray(x).item() if np.ndim(x) == 0 else np.asarray(x), kernel)
 
 
 def _largest(tree: Any) -> float:
