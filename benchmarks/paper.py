@@ -176,7 +176,8 @@ def table(columns: Sequence[str], rows: Sequence[Sequence[Any]], note: str) -> d
 
 def printed(name: str, made: dict[str, Any], more: Iterable[str] = ()) -> None:
     """A table with aligned columns, its note above and remarks below."""
-    print(f"\n{name}. {made['note']}")
+    print()
+    print(textwrap.fill(f"{name}{'' if name.endswith('?') else '.'} {made['note']}", 118))
     lines = [made["columns"], *made["rows"]]
     widths = [max(len(line[k]) for line in lines) for k in range(len(made["columns"]))]
     for line in lines:
@@ -398,9 +399,9 @@ def print_nonsmooth(found: list[dict[str, Any]]) -> dict[str, Any]:
         smooth = [r["ratio"] for r in found if r["order"] == order and r["source"].startswith("smooth")]
         ahead, behind = sum(x > 1.02 for x in rough), sum(x < 0.98 for x in rough)
         remarks.append(
-            f"order {order}: SMITSM ahead of SSPH (by more than 2 percent) under {ahead} of {len(rough)} nonsmooth sources, "
-            f"behind under {behind}; ratios {min(rough):.2g} to {max(rough):.2g}, under smooth ones {min(smooth):.2g} to "
-            f"{max(smooth):.2g}. {why}"
+            f"order {order}: SMITSM ahead of SSPH (by more than 2 percent) under {ahead} of {len(rough)} nonsmooth "
+            f"sources, behind under {behind}; ratios {min(rough):.2g} to {max(rough):.2g}, under smooth ones "
+            f"{min(smooth):.2g} to {max(smooth):.2g}. {why}"
         )
     printed("Is SMITSM ahead under nonsmooth sources?", made, remarks)
     return made

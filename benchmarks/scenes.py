@@ -66,8 +66,9 @@ def step(sparse: float = 0.12, ratio: float = 10.0, at: float = 0.75, seed: int 
 
 
 def cluster(
-    sparse: float = 0.07, ratio: float = 10.0, centre: tuple[float, float] = (0.62, 0.43), radius: float = 0.12, seed: int = 13
-) -> js.Cloud:
+    sparse: float = 0.07, ratio: float = 10.0, centre: tuple[float, float] = (0.62, 0.43), radius: float = 0.12,
+    seed: int = 13,
+) -> js.Cloud:  # fmt: skip
     """The unit square with a disc in which the spacing is ``ratio`` times finer, without transition."""
     dense = sparse / ratio
     around = _away(halton(round(1 / sparse**2), seed), 0.3 * sparse)
@@ -90,7 +91,7 @@ def star(spacing: float = 0.0285, groups: Mapping[str, Callable] | None = None, 
     """A smooth star with five arms; about 4200 particles at the spacing 0.0285."""
 
     def inside(x):
-        # The +1e-300 keeps the gradient finite at the centre.
+        # 1e-300 keeps the gradient finite at the centre.
         return jnp.sqrt(x[0] ** 2 + x[1] ** 2 + 1e-300) - star_radius(jnp.arctan2(x[1], x[0]))
 
     return js.from_sdf(inside, ((-1.3, -1.3), (1.3, 1.3)), spacing, seed=seed, groups=groups)
@@ -99,9 +100,7 @@ def star(spacing: float = 0.0285, groups: Mapping[str, Callable] | None = None, 
 STAR_PARTS = {"lower": lambda x: x[:, 1] < -0.2, "upper": lambda x: x[:, 1] >= -0.2}
 
 
-def holed_plate(
-    half: float = 3.0, near: float = 0.11, growth: float = 0.16, seed: int = 4
-) -> js.Cloud:
+def holed_plate(half: float = 3.0, near: float = 0.05, growth: float = 0.15, seed: int = 4) -> js.Cloud:
     """The square [-half, half]^2 with a hole of radius 1; the spacing grows from ``near`` away from the hole."""
     shape = js.sdf.difference(js.sdf.rectangle((-half, -half), (half, half)), js.sdf.circle((0.0, 0.0), 1.0))
 

@@ -18,6 +18,9 @@ from jsmitsm.neighbours import nearest
 
 # Up to this a stencil is healthy.
 LEBESGUE = 1.5
+# A particle with conditions of its own (a Neumann side) is one-sided by nature: short of a healthy
+# stencil a wider one costs it more accuracy than it gains, unless the old one is as bad as this.
+HOPELESS = 10.0
 # A moment system that misses what is asked of it by more than this does not determine it.
 DEFECT = 1e-6
 
@@ -55,7 +58,7 @@ def repaired(
     """Give weak particles wider stencils, then balanced ones; keep the healthiest found.
 
     Tried in turn until L <= 1.5: 1.5 and 2.2 times the neighbours, then stencils with some
-    neighbours from every direction.
+    neighbours from every direction. Particles with conditions of their own take no half measures.
     """
     shared = dz.shared_elimination(disc, nums)
     points = disc.images.searched(np.asarray(disc.cloud.points))
@@ -67,7 +70,7 @@ def repaired(
             new_classes.append(cls)
             new_rows.append(row)
             continue
-        best = _Best(cls.ids[weak], lebesgue[weak], row, weak, cls.neighbours[weak])
+        best = _Best(cls.ids[weak], lebesgue[weak], row, weak, cls.neighbours[weak], bool(cls.scheme.n_own))
         size = int((cls.neighbours >= 0).sum(axis=1).max())
         width = min(len(points), round(2.2 * size))
         for attempt in (_wider(1.5), _wider(2.2), _balanced(1.0), _balanced(1.5), _balanced(2.2)):
@@ -99,7 +102,10 @@ def _score(row: Row) -> np.ndarray:
 class _Best:
     """The healthiest row found so far of every weak particle."""
 
-    def __init__(self, ids: np.ndarray, lebesgue: np.ndarray, row: Row, at: np.ndarray, neighbours: np.ndarray):
+    def __init__(
+        self, ids: np.ndarray, lebesgue: np.ndarray, row: Row, at: np.ndarray, neighbours: np.ndarray, one_sided: bool
+    ):
+        self.one_sided = one_sided
         self.ids, self.lebesgue, self.neighbours = ids, lebesgue.copy(), neighbours
         self.row = _take(row, at)
         self.changed = np.zeros(len(ids), bool)
@@ -107,7 +113,10 @@ class _Best:
     def update(self, at: np.ndarray, neighbours: np.ndarray, row: Row) -> None:
         """Take over the rows of ``at`` that came out healthier."""
         score = _score(row)
-        better = np.flatnonzero(score < self.lebesgue[at])
+        gain = score < self.lebesgue[at]
+        if self.one_sided:
+            gain &= (score <= LEBESGUE) | (self.lebesgue[at] > HOPELESS)
+        better = np.flatnonzero(gain)
         width = max(self.neighbours.shape[1], neighbours.shape[1])
         self.neighbours = _widened(self.neighbours, width, 1, -1)
         here, trial = _wide_row(self.row, width), _wide_row(_take(row, better), width)

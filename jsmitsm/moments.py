@@ -246,8 +246,17 @@ def _predicted(scheme, near, solution, own, data, tests):
     wanted = np.zeros((rec.fields, rec.fields * rec.size))
     wanted[np.arange(rec.fields), np.arange(rec.fields) * rec.size] = 1.0
     w, v, v_own, defect = functional(scheme, near, system, jnp.asarray(wanted))
-    lebesgue = jnp.sum(jnp.abs(w), axis=0)
-    return w, v * solution.lift[:, None], v_own * system.own_scale[:, None], lebesgue, defect, system
+    return w, v * solution.lift[:, None], v_own * system.own_scale[:, None], _lebesgue(rec, near, w), defect, system
+
+
+def _lebesgue(rec: Recursion, near: Support, w: Any) -> Any:
+    """sum_g |w_g| of each field over its neighbours' values of the same field: (F,).
+
+    Weights of other fields and of conditions given as data have other units: they couple the
+    equations and say nothing of the stencil.
+    """
+    values = w[: near.weight.shape[0] * rec.fields].reshape(-1, rec.fields, rec.fields)
+    return jnp.einsum("gff->f", jnp.abs(values))
 
 
 def _collocated(scheme, near, solution, own, data, tests):
