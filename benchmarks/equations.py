@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
-import platform
 import sys
 import time
 from collections.abc import Callable, Mapping
@@ -22,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jsmitsm as js
-from benchmarks import scenes
+from benchmarks import machine, scenes
 
 DATA = Path(__file__).parent / "data" / "equations.json"
 
@@ -212,10 +210,6 @@ LINEAR = [
 def _balanced(x):
     """The smooth function in the star's coordinates."""
     return jnp.exp(0.7 * x[0]) * jnp.cos(1.8 * x[1] + 0.4) + x[0] * x[1] ** 3
-
-
-def _flux(exact: Callable) -> js.Condition:
-    return slope(exact)
 
 
 def _robin(exact: Callable) -> js.Condition:
@@ -530,16 +524,6 @@ def shown(line: dict[str, Any]) -> str:
 HEAD = "case                 p     N  error    ceiling seconds form  rep. weak  effectiv.  rank"
 
 
-def machine() -> dict[str, Any]:
-    """What the seconds depend on."""
-    import jaxlib
-
-    return {
-        "processor": platform.processor() or platform.machine(), "cores": os.cpu_count(), "system": platform.system(),
-        "python": platform.python_version(), "jax": jax.__version__, "jaxlib": jaxlib.__version__,
-    }  # fmt: skip
-
-
 def main(arguments: list[str]) -> None:
     jax.config.update("jax_enable_x64", True)
     names = [a for a in arguments if not a.startswith("--")]
@@ -557,7 +541,7 @@ def main(arguments: list[str]) -> None:
             lines[name, order] = line
     ordered = [lines[key] for key in sorted(lines, key=lambda key: (list(EQUATIONS).index(key[0]), key[1]))]
     DATA.parent.mkdir(exist_ok=True)
-    DATA.write_text(json.dumps({"machine": machine(), "lines": ordered}, indent=1) + "\n")
+    DATA.write_text(json.dumps({"machine": machine.describe(), "lines": ordered}, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -1,0 +1,65 @@
+"""Equations of every kind against the ceilings of the benchmark's table.
+
+A quick part of ``python -m benchmarks.equations``: the default kernel and stencils, clouds and
+solutions that nothing was tuned on. Each line asserts the error, further errors (pressure, stress
+concentration), Newton steps and observed orders that the table states.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmarks.equations import EQUATIONS, estimated, missed, run, shown
+
+LINEAR = [
+    ("diffusion", 4), ("diffusion", 8), ("anisotropy", 4), ("rotated", 6), ("helmholtz", 6), ("heat", 4),
+    ("convection", 4), ("wave", 6), ("u_xy", 6), ("biharmonic", 4),
+]  # fmt: skip
+SHAPES = [("star", 4), ("star mixed", 4), ("star neumann", 4), ("ball", 4), ("step", 4), ("step", 8), ("cluster", 6)]
+NONLINEAR = [("bratu 1D", 8), ("quasilinear", 4), ("burgers", 4)]
+SYSTEMS = [
+    ("elasticity", 4), ("kirsch", 6), ("cantilever", 4), ("stokes", 6), ("reaction-diffusion", 4), ("elasticity 3D", 4)
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "order"), [*LINEAR, *SHAPES, *NONLINEAR, *SYSTEMS])
+def test_error_is_below_its_ceiling(name, order):
+    line = run(replace(EQUATIONS[name], coarse=None), order, estimate=False)
+    assert not missed(line), shown(line)
+
+
+def test_newton_keeps_the_order():
+    line = run(EQUATIONS["bratu 2D"], 4, estimate=False)
+    assert not missed(line), shown(line)
+    assert line["rate"] > 3.5
+
+
+@pytest.mark.parametrize(("name", "form"), [("heat", "loo"), ("diffusion", "loo"), ("wave", "lsq"), ("u_xy", "lsq")])
+def test_global_form_follows_the_operator(name, form):
+    """Where information travels, least squares; elliptic and parabolic equations, leave-one-out."""
+    assert EQUATIONS[name].solve(4 if name != "wave" else 6).stats["formulation"] == form
+
+
+@pytest.mark.parametrize("name", ["anisotropy", "heat"])
+def test_error_estimate_knows_size_and_place(name):
+    case = EQUATIONS[name]
+    found = estimated(case, case.solve(4))
+    assert 0.2 < found["effectivity"] < 5
+    assert found["rank"] > 0.75
+
+
+def test_a_wrong_solution_misses():
+    """The measure itself: an error of 1e-4 in one of two fields is seen, a constant in a floating field is not."""
+    case = EQUATIONS["stokes"]
+    cloud = case.cloud()
+    true = case.values(cloud.points)
+
+    class Fake:
+        u = true + np.array([0.0, 0.0, 7.0])
+
+    Fake.cloud = cloud
+    assert case.error(Fake) == 0.0
+    assert np.abs(case.errors(Fake)).max() < 1e-14
+    Fake.u = true * np.array([1.0, 1.0 + 1e-4, 1.0])
+    assert np.isclose(case.error(Fake), 1e-4)
