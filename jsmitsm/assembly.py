@@ -181,39 +181,42 @@ def _tests(scheme: Scheme, near: Support) -> Any:
 @partial(jax.jit, static_argnums=(0,))
 def recoveries(
     scheme: Scheme, points: Any, kernel: Kernel, ids: Any, neighbours: Any, operands: Operands,
-    each: tuple = (), whole: tuple = (),
+    each: tuple[Any, Any], whole: tuple = (),
 ) -> Recovery:  # fmt: skip
-    """Stage 1 of I and II for the particles ``ids``; ``operands.own`` without held values."""
+    """Stage 1 of I and II for the particles ``ids``; ``operands.own`` without held values.
+
+    each: source (n, rows) and values of the own conditions (n, n_own).
+    """
     TRACES["rows"] += 1
 
-    def particle(i, near_ids, jac, own):
+    def particle(i, near_ids, jac, own, source, given):
         near, solution, own, *_ = _prepared(replace(scheme, method=""), points, kernel, i, near_ids, operands, jac, own)
-        return closure.recover(scheme, near, solution, own)
+        return closure.recover(scheme, near, solution, own, source, given)
 
-    return _mapped(particle, ids, neighbours, operands)
+    return _mapped(particle, ids, neighbours, operands, *each)
 
 
 @_in_size_classes
 @partial(jax.jit, static_argnums=(0,))
 def closed_rows(
     scheme: Scheme, points: Any, kernel: Kernel, ids: Any, neighbours: Any, operands: Operands,
-    each: tuple, whole: tuple[Any, Recovery, Any],
-) -> tuple[Any, Row]:  # fmt: skip
-    """The rows of I and II over values only, and the neighbours they reach, (n, ns + ns nr).
+    each: tuple[Any], whole: tuple[Any, Recovery],
+) -> Row:  # fmt: skip
+    """The rows of I and II over values only.
 
-    whole: every particle's neighbours in stage 1, recovery, and its part from source and conditions.
+    each: the particles that a row reaches, (n, w); whole: every particle's neighbours in stage 1 and its recovery.
     """
     TRACES["rows"] += 1
-    far_ids, recovered, constant = whole
+    far_ids, recovered = whole
 
-    def particle(i, near_ids, jac, own):
+    def particle(i, near_ids, jac, own, reach):
         near, solution, own, *_ = _prepared(scheme, points, kernel, i, near_ids, operands, jac, own)
         made = closure.closing(scheme, near, solution, own)
-        reached, weights, more = closure.composed(near_ids, made, far_ids, recovered, constant)
+        weights, more = closure.composed(near_ids, made, far_ids, recovered, reach)
         size = jnp.sum(jnp.abs(weights))
-        return reached, Row(
-            weights[None, :, None], jnp.zeros((1, reached.shape[0], 0)), made.source[None], made.condition[None],
+        return Row(
+            weights[None, :, None], jnp.zeros((1, reach.shape[0], 0)), made.source[None], made.condition[None],
             size[None], made.defect, more[None],
         )  # fmt: skip
 
-    return _mapped(particle, ids, neighbours, operands)
+    return _mapped(particle, ids, neighbours, operands, *each)

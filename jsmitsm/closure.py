@@ -114,12 +114,14 @@ class Recovery(NamedTuple):
 
     weights: Any  # (free, ns)
     own: Any  # (free,) of the particle's own value
-    source: Any  # (free, rows)
-    condition: Any  # (free, n_own)
+    constant: Any  # (free,) from the source and the particle's conditions
 
 
-def recover(scheme: Scheme, near: Support, solution: Elimination, own: Any) -> Recovery:
-    """Stage 1 for one particle: its free coefficients as functionals of its neighbours' values."""
+def recover(scheme: Scheme, near: Support, solution: Elimination, own: Any, source: Any, given: Any) -> Recovery:
+    """Stage 1 for one particle: its free coefficients as functionals of its neighbours' values.
+
+    source (rows,): the recursion's right-hand side; given (n_own,): the values of its conditions.
+    """
     zero = (0, (0,) * scheme.rec.dim)
     slots = scheme.own if zero in scheme.own else (zero, *scheme.own)
     at = [slots.index(s) for s in scheme.own]
@@ -132,8 +134,11 @@ def recover(scheme: Scheme, near: Support, solution: Elimination, own: Any) -> R
     wanted[np.arange(len(scheme.free)), np.array(scheme.free)] = 1.0
     w, v, v_own, _ = functional(held, near, system, jnp.asarray(wanted))
     scale = near.length ** -np.array([float(sum(a)) for a in free_multi_indices(scheme)])
-    v_own = v_own * system.own_scale[:, None] * scale
-    return Recovery((w * scale).T, v_own[0], (v * solution.lift[:, None] * scale).T, v_own[1:].T)
+    v_own = v_own * system.own_scale[:, None]
+    constant = (solution.lift * source) @ v
+    if scheme.n_own:
+        constant = constant + given @ v_own[1:]
+    return Recovery((w * scale).T, v_own[0] * scale, constant * scale)
 
 
 class Closing(NamedTuple):
@@ -158,14 +163,17 @@ def closing(scheme: Scheme, near: Support, solution: Elimination, own: Any) -> C
     return Closing(w.reshape(-1, n) * lift, v[:, 0] * solution.lift, v_own[:, 0] * system.own_scale, defect)
 
 
-def composed(near_ids: Any, row: Closing, far_ids: Any, recovered: Recovery, constant: Any) -> tuple[Any, Any, Any]:
-    """Insert the recovered coefficients into one row: neighbours, weights, and a constant.
+def composed(near_ids: Any, row: Closing, far_ids: Any, recovered: Recovery, reach: Any) -> tuple[Any, Any]:
+    """Insert the recovered coefficients into one row: weights of the values of ``reach``, and a constant.
 
-    near_ids (ns,); far_ids (N, nr), recovered and constant (N, free) are those of every particle.
+    near_ids (ns,), reach (w,); far_ids (N, nr) and ``recovered`` are those of every particle.
     """
+    n = far_ids.shape[0]
     index = jnp.maximum(near_ids, 0)
     own = jnp.einsum("gb,gb->g", row.weights, recovered.own[index])
     far = jnp.einsum("gb,gbr->gr", row.weights, recovered.weights[index])
-    ids = jnp.where((near_ids >= 0)[:, None], far_ids[index], -1)
-    total = jnp.sum(row.weights * constant[index])
-    return jnp.concatenate([near_ids, ids.reshape(-1)]), jnp.concatenate([own, far.reshape(-1)]), total
+    # One entry for each particle of the cloud on the way: neighbours of neighbours meet in it.
+    place = lambda ids: jnp.where(ids >= 0, ids, n)
+    total = jnp.zeros(n).at[place(near_ids)].add(own, mode="drop").at[place(far_ids[index])].add(far, mode="drop")
+    weights = total.at[place(reach)].get(mode="fill", fill_value=0.0)
+    return weights, jnp.sum(row.weights * recovered.constant[index])

@@ -64,15 +64,17 @@ def _iterate(run: Run, values: Any, taylor: Any, one: tuple[Any, Any]) -> tuple[
     """Damped Newton's method; the length of the next step must not grow (natural monotonicity)."""
     target = tuple(np.asarray(concrete(x)) for x in one)
     values = np.asarray(concrete(values))
+    # Lengths are absolute: measured against values that grow, a step that leads away looks shorter.
     length, steps, rate = _distance(target[0], values), 1, 0.1
-    while length > TOLERANCE and steps < MOST:
+    while length > TOLERANCE * _size(target[0]) and steps < MOST:
         part = 1.0
         while True:
             values_new = values + part * (target[0] - values)
             taylor_new = taylor + part * (target[1] - taylor)
             next_target = _tried(run, taylor_new)
             next_length = np.inf if next_target is None else _distance(next_target[0], values_new)
-            if next_length <= (1.0 - part / 4.0) * length or next_length < TOLERANCE or part <= SHORTEST:
+            small = TOLERANCE * _size(values_new)
+            if next_length <= max((1.0 - part / 4.0) * length, small) or part <= SHORTEST:
                 break
             part /= 2.0
         if next_target is None or not np.isfinite(next_length):
@@ -80,11 +82,13 @@ def _iterate(run: Run, values: Any, taylor: Any, one: tuple[Any, Any]) -> tuple[
         rate = next_length / length if part == 1.0 else rate
         values, taylor, target, length = values_new, taylor_new, next_target, next_length
         steps += 1
-    good = bool(length <= 1e-8)
+    relative = length / _size(target[0])
+    good = bool(relative <= 1e-8)
     if not good:
         run.fail(
-            f"Newton's method did not converge: after {steps} steps the next one would still change u by {length:.1e} "
-            "of its size; start nearer (u0), approach the parameters in stages, or refine the cloud"
+            f"Newton's method did not converge: after {steps} steps the next one would still change u by "
+            f"{relative:.1e} of its size; start nearer (u0), approach the parameters in stages (js.continuation), or "
+            "refine the cloud"
         )
     return target[0], target[1], good, steps, rate
 
@@ -99,8 +103,11 @@ def _tried(run: Run, taylor: Any) -> tuple[np.ndarray, np.ndarray] | None:
 
 
 def _distance(new: np.ndarray, old: np.ndarray) -> float:
-    size = np.abs(new).max(initial=0.0)
-    return float(np.abs(new - old).max() / (size if size > 0 else 1.0))
+    return float(np.abs(new - old).max())
+
+
+def _size(values: np.ndarray) -> float:
+    return float(np.abs(values).max(initial=0.0)) or 1.0
 
 
 def _compiled(run: Run, values: Any, taylor: Any) -> tuple[Any, Any, Any, Any]:

@@ -55,34 +55,56 @@ def all_rows(disc: Discretization, nums: Numbers) -> tuple[list[Class], list[Row
 def _two_stage_rows(disc: Discretization, nums: Numbers, shared: Any) -> tuple[list[Class], list[Row]]:
     """Methods I and II: recover every particle's coefficients, then insert them into the rows."""
     wide, far = _recovery_kernel(disc)
-    n_free = len(disc.scheme.free)
-    parts, constants, order = [], [], []
     conditioned = np.zeros(len(disc.cloud), int)
     for group in disc.groups:
         conditioned[group.ids] = 0 if group.held else group.n_rows
+    parts, order = [], []
     for count in np.unique(conditioned):
-        ids = np.flatnonzero(conditioned == count)
-        cls = Class(ids, far[ids], replace(disc.scheme, n_own=int(count)))
-        given = operands(disc, nums, ids, cls.scheme, shared)
-        made = assembly.recoveries(cls.scheme, disc.points, wide, ids, cls.neighbours, given)
-        source, values = right_sides(disc, nums, cls)
-        constants.append(
-            jnp.einsum("nbr,nr->nb", made.source, source) + jnp.einsum("nbk,nk->nb", made.condition, values)
+        cls = Class(np.flatnonzero(conditioned == count), far, replace(disc.scheme, n_own=int(count)))
+        given = operands(disc, nums, cls.ids, cls.scheme, shared)
+        parts.append(
+            assembly.recoveries(
+                cls.scheme, disc.points, wide, cls.ids, far[cls.ids], given, right_sides(disc, nums, cls)
+            )
         )
-        parts.append(made._replace(source=jnp.zeros((len(ids), n_free, 0)), condition=jnp.zeros((len(ids), n_free, 0))))
-        order.append(ids)
+        order.append(cls.ids)
+    xp = jnp if is_traced(parts) else np
     back = np.argsort(np.concatenate(order))
-    recovered = jax.tree.map(lambda *x: jnp.concatenate(x)[back], *parts)
-    constant = jnp.concatenate(constants)[back]
+    recovered = jax.tree.map(lambda *x: xp.concatenate(x)[back], *parts)
+    reach = _reach(disc.stencils.indices, far)
     classes, rows = [], []
     for cls in disc.classes:
         given = operands(disc, nums, cls.ids, cls.scheme, shared)
-        reached, row = assembly.closed_rows(
-            cls.scheme, disc.points, disc.kernel, cls.ids, cls.neighbours, given, (), (far, recovered, constant)
+        reached = reach[cls.ids]
+        rows.append(
+            assembly.closed_rows(
+                cls.scheme, disc.points, disc.kernel, cls.ids, cls.neighbours, given, (reached,), (far, recovered)
+            )
         )
-        classes.append(replace(cls, neighbours=reached if is_traced(reached) else np.asarray(reached)))
-        rows.append(row)
+        classes.append(replace(cls, neighbours=reached))
     return classes, rows
+
+
+def _reach(near: Any, far: Any) -> np.ndarray:
+    """The neighbours of every particle's neighbours, those included: (N, w), -1 for none."""
+    n = len(near)
+    if is_traced(near, far):  # nothing is known of them but that they are in the cloud
+        return np.broadcast_to(np.arange(n), (n, n))
+    one, two = (_pattern(np.asarray(x), n) for x in (near, far))
+    both = (one @ two + one).tocsr()
+    both.sort_indices()
+    count = np.diff(both.indptr)
+    out = np.full((n, count.max()), -1, np.int32)
+    out[np.arange(out.shape[1]) < count[:, None]] = both.indices
+    return out
+
+
+def _pattern(near: np.ndarray, n: int) -> Any:
+    """Who is whose neighbour, as a sparse matrix (N, N) of ones."""
+    from scipy.sparse import csr_matrix
+
+    i, k = np.nonzero(near >= 0)
+    return csr_matrix((np.ones(len(i), np.float32), (i, near[i, k])), (n, n))
 
 
 def _recovery_kernel(disc: Discretization) -> tuple[Kernel, Any]:
@@ -91,14 +113,17 @@ def _recovery_kernel(disc: Discretization) -> tuple[Kernel, Any]:
     assert kernel is not None  # layout gives I and II one
     count = math.ceil(1.5 * len(disc.scheme.free)) + 1
     if disc.given_stencils or is_traced(near, points, kernel):
-        away = jnp.where(near >= 0, jnp.sum((points[jnp.maximum(near, 0)] - points[:, None]) ** 2, axis=2), jnp.inf)
-        reach = jnp.sqrt(jnp.sort(away, axis=1)[:, min(count, near.shape[1]) - 1])
-        reach = jnp.where(jnp.isfinite(reach), reach, 0.0)
-        return kernel.replace(h=jnp.maximum(kernel.h, reach / (0.9 * kernel.d))), near
-    host = np.asarray(points)
-    reach = nearest(host, min(count, len(host))).radius
-    h = np.maximum(np.asarray(kernel.h), reach / (0.9 * np.asarray(kernel.d)))
-    return kernel.replace(h=h), within(host, h * np.asarray(kernel.d)).indices
+        xp = jnp if is_traced(near, points) else np
+        near, points = xp.asarray(near), xp.asarray(points)
+        away = xp.where(near >= 0, xp.sum((points[xp.maximum(near, 0)] - points[:, None]) ** 2, axis=2), xp.inf)
+        reach = xp.sqrt(xp.sort(away, axis=1)[:, min(count, near.shape[1]) - 1])
+        reach = xp.where(xp.isfinite(reach), reach, 0.0)
+    else:
+        near = None
+        reach = nearest(np.asarray(points), min(count, len(points))).radius
+    xp = jnp if is_traced(reach, kernel) else np
+    wide = kernel.replace(h=xp.maximum(kernel.h, reach / (0.9 * kernel.d)))
+    return wide, within(np.asarray(points), wide.h * np.asarray(kernel.d)).indices if near is None else near
 
 
 def class_rows(disc: Discretization, nums: Numbers, cls: Class, shared: Any) -> Row:
