@@ -21,7 +21,13 @@ __version__ = "0.1.0"
 
 # Imported when first used: they need more than solving does.
 _LAZY = {"plot": "jsmitsm.plot", "files": "jsmitsm.files"}
-_LAZY_NAMES = {"tune": "jsmitsm.tuning", "TuneResult": "jsmitsm.tuning", "show_versions": "jsmitsm.versions"}
+_LAZY_NAMES = {
+    "TuneResult": "jsmitsm.tuning",
+    "continuation": "jsmitsm.stages",
+    "quadrature": "jsmitsm.boundary_quadrature",
+    "show_versions": "jsmitsm.versions",
+    "tune": "jsmitsm.tuning",
+}
 
 
 def __getattr__(name: str) -> Any:

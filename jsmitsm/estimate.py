@@ -26,13 +26,16 @@ def error_estimate(solution: Solution) -> Any:
 
     The defect of the solution in rows of order p + 2, taken through the inverse of its own
     matrix: e = A_p^-1 D (b_{p+2} - A_{p+2} u_p). D brings the rows of the two orders to one scale,
-    that of the source in them. Held values have no error; where p + 2 is no better than p (no
+    that of the source in them. A least-squares solution is compared with that of order p + 2: its
+    rows have no common scale. Held values have no error; where p + 2 is no better than p (no
     smoothness, or round-off) the estimate says little.
     """
     fit: Fit = solution._fit
     if fit is None:
         raise ValueError("error_estimate: this solution was pickled without its problem; ask before pickling")
     low = fit.discretization()
+    if fit.recipe.formulation == "lsq":
+        return _against_higher(fit, low, solution._values)
     run = Run(low, fit.problem, "auto", True, False, "loo")
     nums = dz.numbers(low, fit.problem, fit.taylor)
     classes, rows = dz.all_rows(low, nums)
@@ -49,6 +52,14 @@ def error_estimate(solution: Solution) -> Any:
     zero = xp.zeros(low.held.size)
     error = zero.at[free].set(x) if xp is jnp else _put(zero, free, x)
     error = xp.abs(error).reshape(low.held.shape)
+    return error[:, 0] if low.rec.fields == 1 else error
+
+
+def _against_higher(fit: Fit, low: Discretization, values: Any) -> Any:
+    """The distance to the least-squares solution of order p + 2, (N,) or (N, F)."""
+    high, nums = _higher(fit, low)
+    reference, _ = Run(high, fit.problem, "auto", True, False, "lsq").step(nums)
+    error = abs(reference - values)
     return error[:, 0] if low.rec.fields == 1 else error
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from jsmitsm.clouds import Cloud
@@ -21,23 +23,56 @@ def simplices(cloud: Cloud) -> np.ndarray:
     >>> simplices(js.rectangle((0, 0), (1, 1), (3, 3))).shape
     (8, 3)
     """
+    points = _scaled(cloud)
+    if cloud.dim == 1:
+        order = np.argsort(points[:, 0])
+        return np.stack([order[:-1], order[1:]], axis=1)
+    cells = _delaunay(points).simplices
+    return cells[_solid(points, cells) & ~_outside(cloud, points, cells)]
+
+
+def boundary_facets(cloud: Cloud) -> tuple[np.ndarray, np.ndarray]:
+    """Facets (M, D) between boundary particles that enclose the domain, and their unit outward normals (M, D).
+
+    >>> import jsmitsm as js
+    >>> facets, normals = boundary_facets(js.rectangle((0, 0), (1, 1), (3, 3)))
+    >>> facets.shape, normals.sum(axis=0).tolist()
+    ((8, 2), [0.0, 0.0])
+    """
+    points = _scaled(cloud)
+    if cloud.dim == 1:
+        ends = np.array([[points[:, 0].argmin()], [points[:, 0].argmax()]])
+        return ends, np.array([[-1.0], [1.0]])
+    delaunay = _delaunay(points)
+    cells = delaunay.simplices
+    inside = ~_outside(cloud, points, cells)
+    # Flat simplices count here: without them their neighbours' facets would face nothing.
+    facets = np.concatenate([np.delete(cells[inside], k, axis=1) for k in range(cells.shape[1])])
+    _, first, count = np.unique(np.sort(facets, axis=1), axis=0, return_index=True, return_counts=True)
+    facets = facets[first[count == 1]]
+    at = points[facets]
+    sides = at[:, 1:] - at[:, :1]
+    normal = np.stack([sides[:, 0, 1], -sides[:, 0, 0]], 1) if cloud.dim == 2 else np.cross(sides[:, 0], sides[:, 1])
+    length = np.linalg.norm(normal, axis=1, keepdims=True)
+    normal = normal / length
+    ahead = at.mean(axis=1) + 1e-3 * np.linalg.norm(sides[:, 0], axis=1, keepdims=True) * normal
+    into = delaunay.find_simplex(ahead)
+    return facets, np.where(((into >= 0) & inside[into])[:, None], -normal, normal)
+
+
+def _scaled(cloud: Cloud) -> np.ndarray:
+    """The particles (N, D) in the unit box."""
     points = np.asarray(cloud.points, dtype=np.float64)
     if len(points) < cloud.dim + 1:
         raise ValueError(f"cloud: {len(points)} particles make no {cloud.dim}D simplex; add particles")
-    size = np.ptp(points, axis=0).max()
-    scaled = (points - points.min(axis=0)) / size
-    cells = _delaunay(scaled)
-    return cells[_solid(scaled, cells) & ~_outside(cloud, scaled, cells)]
+    return (points - points.min(axis=0)) / np.ptp(points, axis=0).max()
 
 
-def _delaunay(points: np.ndarray) -> np.ndarray:
-    if points.shape[1] == 1:
-        order = np.argsort(points[:, 0])
-        return np.stack([order[:-1], order[1:]], axis=1)
+def _delaunay(points: np.ndarray) -> Any:
     from scipy.spatial import Delaunay, QhullError
 
     try:
-        return Delaunay(points).simplices
+        return Delaunay(points)
     except QhullError:
         raise ValueError(
             f"cloud: its {len(points)} particles lie on one line or plane, no {points.shape[1]}D simplices can be made"

@@ -109,6 +109,26 @@ class Solution:
         values = _evaluate(b, self.order, self.cloud.points, self._taylor, points, near, weight)
         return values[:, 0] if self._recipe.fields == 1 else values
 
+    def integral(self, group: str) -> Any:
+        """The integral of u over a boundary group, a scalar or (F,); see :func:`jsmitsm.quadrature`."""
+        from jsmitsm.boundary_quadrature import quadrature
+
+        points, weights, _ = quadrature(self.cloud, group)
+        return jnp.tensordot(weights, self(points), axes=1)
+
+    def flux(self, group: str, conductivity: Any = 1.0) -> Any:
+        """The integral of conductivity n . grad u over a boundary group, n outward: a scalar or (F,).
+
+        conductivity : a number, or a function of one point x (D,).
+        """
+        from jsmitsm.boundary_quadrature import quadrature
+
+        points, weights, normals = quadrature(self.cloud, group)
+        if callable(conductivity):
+            conductivity = jax.vmap(conductivity)(points)
+        slope = jnp.einsum("q...d,qd->q...", self.grad(points), normals)
+        return jnp.tensordot(weights * conductivity, slope, axes=1)
+
     def error_estimate(self) -> Any:
         """Estimated error |u - u_exact| at every particle, (N,) or (N, F); see :mod:`jsmitsm.estimate`.
 

@@ -124,7 +124,7 @@ def solve(
     else:
         values, taylor, good, iterations = newton(run, u0)
     run.seconds["total"] = time.perf_counter() - start
-    recipe = Recipe(method, order, basis_terms, formulation, problem.fields)
+    recipe = Recipe(method, order, basis_terms, run.formulation, problem.fields)
     fit = Fit(problem, cloud, disc.kernel, dz.table(disc), taylor, recipe)
     return Solution(values, cloud, recipe, fit, good, iterations, run.stats())
 

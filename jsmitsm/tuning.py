@@ -36,8 +36,9 @@ OPTIONS = ("method", "order", "stencils", "basis_terms", "formulation", "solver"
 LEARNING_RATE = 0.1
 # Weight of the Lebesgue bound: being e times above it costs as much as an error e^5 times larger.
 PENALTY = 5.0
-# A pattern is made this much wider than the support, so that a growing support seldom needs another.
-MARGIN = 1.1
+# A pattern is this much wider than the support, and one that a growing support needs, by the second:
+# every new pattern is compiled for.
+MARGINS = (1.1, 1.35)
 # No parameter changes by more than this factor's logarithm in one step.
 STRIDE = 0.5
 # The search ends when so many steps in a row gained less than GAIN.
@@ -280,9 +281,9 @@ class _Scene:
         support = self.support(kernel)
         if self.pattern is not None and (support <= np.asarray(self.pattern.radius) * EDGE).all():
             return
-        radius = support * MARGIN
+        radius = support * MARGINS[0]
         if self.pattern is not None:
-            radius = np.maximum(radius, np.asarray(self.pattern.radius))
+            radius = np.maximum(support * MARGINS[1], np.asarray(self.pattern.radius))
         self.disc = self.discretized(kernel, radius)
         self.pattern = self.disc.stencils
         self.numbers = dz.numbers(self.disc, self.problem) if self.disc.linear else None
