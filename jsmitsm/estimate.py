@@ -48,7 +48,7 @@ def error_estimate(solution: Solution) -> Any:
     xp = jnp if is_traced(ratio) else np
     ratio = xp.where(xp.isfinite(ratio) & (ratio != 0), ratio, 1.0)
     data, r, c = dz.matrix(low, classes, rows)
-    x, _ = run.solved(data, r, c, ratio * defect[0].reshape(-1)[free])
+    x, _ = run.solved(data, r, c, ratio * defect[0].reshape(-1)[free], balanced=False)
     zero = xp.zeros(low.held.size)
     error = zero.at[free].set(x) if xp is jnp else _put(zero, free, x)
     error = xp.abs(error).reshape(low.held.shape)

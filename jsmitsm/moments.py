@@ -134,15 +134,29 @@ def eliminate_on_host(scheme: Scheme, jac: np.ndarray) -> Elimination:
     if scheme.method == "SSPH":
         return Elimination(white, np.zeros((white.shape[0], len(matrix))), lift, rows)
     if scheme.method == "S":
-        q, r = np.linalg.qr((matrix @ white).T, mode="complete")
-        k = len(matrix)
-        return Elimination(white @ q[:, k:], white @ q[:, :k] @ np.linalg.inv(r[:k]).T, lift, rows)
+        return Elimination(*_refined(matrix, white), lift, rows)
     free, dependent = np.array(scheme.free), np.array(scheme.dependent, int)
     basis, particular = np.zeros((rec.size, len(free))), np.zeros((rec.size, len(matrix)))
     particular[dependent] = np.linalg.inv(matrix[:, dependent])
     basis[free, np.arange(len(free))] = 1.0
     basis[dependent] = -particular[dependent] @ matrix[:, free]
     return Elimination(basis, particular, lift, rows)
+
+
+def _refined(matrix: np.ndarray, white: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Null space and pseudo-inverse of the constraints, rounded once.
+
+    All particles share their error: unlike that of one particle it does not average out in the
+    global system, which amplifies it as the inverse square of the spacing.
+    """
+    k = len(matrix)
+    q, r = np.linalg.qr((matrix @ white).T, mode="complete")
+    wide = white.astype(np.longdouble)
+    whitened = matrix.astype(np.longdouble) @ wide
+    inverse = q[:, :k] @ np.linalg.inv(r[:k]).T
+    null = q[:, k:] - inverse @ (whitened @ q[:, k:])
+    inverse = inverse + inverse @ (np.eye(k) - whitened @ inverse)
+    return (wide @ null).astype(float), (wide @ inverse).astype(float)
 
 
 def _all_free(scheme: Scheme) -> np.ndarray:

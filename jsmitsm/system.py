@@ -102,8 +102,11 @@ class Run:
     def _failed(self) -> bool:
         return any(m.startswith("FAILED") for m in self.messages)
 
-    def solved(self, data: Any, r: Any, c: Any, b: Any) -> tuple[Any, bool]:
-        """Solve the global system; floating fields get a zero mean by a Lagrange multiplier."""
+    def solved(self, data: Any, r: Any, c: Any, b: Any, balanced: bool = True) -> tuple[Any, bool]:
+        """Solve the global system; floating fields get a zero mean by a Lagrange multiplier.
+
+        balanced: the right-hand side is that of a problem, which must balance where a field floats.
+        """
         disc = self.disc
         free = np.flatnonzero(~disc.held.reshape(-1))
         n, fields = len(free), disc.rec.fields
@@ -126,7 +129,7 @@ class Run:
             return np.full(n, np.nan), False
         if not is_traced(x):
             x = np.asarray(x)
-            if disc.floating:
+            if disc.floating and balanced:
                 self._check_compatible(x[n:], np.asarray(b)[:n])
         return x[:n], True
 

@@ -20,6 +20,7 @@ from jsmitsm.jets import evaluate, plain
 from jsmitsm.linearize import Record, record
 from jsmitsm.operators import Slot, local_field
 from jsmitsm.program import fingerprint, kept
+from jsmitsm.recall import recalled
 from jsmitsm.series import Ring, full_series, variable
 from jsmitsm.taylor import count
 
@@ -273,7 +274,8 @@ def trace(
     has of its own and that do not vary with x (its normal, a boundary value); ``params``, any
     pytree, passed last unless None.
 
-    The function is called once.  What it closes over may be traced by JAX.  The classification is
+    The function is called once, and not again as long as all that it can see stays the same.  What
+    it closes over may be traced by JAX.  The classification is
     read off the recorded operations, element by element; where in doubt a coefficient counts as
     dependent, which costs time but never correctness.
 
@@ -285,9 +287,23 @@ def trace(
     >>> record.slots, record.order, record.linear, record.constant, record.source
     (((0, (2, 0)), (0, (0, 2))), (2,), True, True, 'variable')
     """
-    r = record(residual, local_field(dim, fields), extras, params)
+    leaves, tree = jax.tree.flatten(params)
+    rest = dim, fields, tuple(extras), tree, tuple((np.shape(v), jnp.result_type(v)) for v in leaves)
+
+    def make() -> Traced:
+        return _classified(record(residual, local_field(dim, fields), extras, params), dim, fields, len(extras), tree)
+
+    return recalled(residual, rest, make, lambda made: not _holds_tracers(made))
+
+
+def _holds_tracers(traced: Traced) -> bool:
+    return any(isinstance(c, jax.core.Tracer) for c in traced._record.consts)
+
+
+def _classified(r: Record, dim: int, fields: int, n_extras: int, params_tree: Any) -> Traced:
+    """Read off the recorded operations what kind of residual it is."""
     zero = r.jaxpr.invars[0].aval.dtype.type(0)
-    facts = _facts(r, len(extras), None)
+    facts = _facts(r, n_extras, None)
     pattern, every = np.zeros((r.n_equations, len(r.slots)), bool), 0
     for k, out in enumerate(r.outputs):
         if out is not None:
@@ -299,7 +315,7 @@ def trace(
     keep = [k for k in range(len(r.slots)) if pattern[:, k].any() or jumps]
     pattern = pattern[:, keep]
     slots = tuple(r.slots[k] for k in keep)
-    rest = _facts(r, len(extras), zero)[0]
+    rest = _facts(r, n_extras, zero)[0]
     if (rest.known & (rest.value == 0)).all():
         source = "zero"
     else:
@@ -316,8 +332,8 @@ def trace(
         source=source,
         uses_extras=bool((every | _bits(facts[0])) & EXTRAS),
         _record=r,
-        _n_extras=len(extras),
-        _params_tree=jax.tree.structure(params),
+        _n_extras=n_extras,
+        _params_tree=params_tree,
     )
 
 
