@@ -22,6 +22,13 @@ def is_traced(*trees: Any) -> bool:
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees))
 
 
+def concrete(x: Any) -> Any:
+    """The numbers behind a value that only carries derivatives; None behind an abstract one."""
+    while isinstance(x, jax.core.Tracer):
+        x = getattr(x, "primal", None)
+    return x
+
+
 @dataclass
 class Functionals:
     """Conditions sum_s coef[i, k, s] d^b u_f = value[i, k] at n particles.

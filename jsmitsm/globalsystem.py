@@ -8,11 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm import assembly
-from jsmitsm.boundary import is_traced
+from jsmitsm.boundary import concrete, is_traced
 from jsmitsm.layout import Class, Discretization, sorted_classes, table
 from jsmitsm.moments import Row
 from jsmitsm.neighbours import Stencils
 from jsmitsm.numbers import Numbers
+from jsmitsm.recursion import Recursion
 from jsmitsm.rows import operands, right_sides, shared_elimination
 
 
@@ -122,36 +123,48 @@ def least_squares(disc: Discretization, nums: Numbers) -> tuple[Any, Any, Any, A
 
 
 def prefers_least_squares(disc: Discretization, nums: Numbers) -> bool:
-    """Whether information travels: operators of first order, hyperbolic ones of second, and those
-    whose convection outweighs diffusion between neighbours (cell Peclet number above 2).
+    """Whether information travels: operators of first order, hyperbolic and parabolic ones of second,
+    and those whose convection outweighs diffusion between neighbours (cell Peclet number above 2).
 
     There a value predicted by neighbours on all sides is the wrong global form.
     """
-    rec = disc.rec
+    rec, jac = disc.rec, concrete(nums.jac)
     orders = {rec.order - q for q in rec.degrees}
-    if disc.scheme.method != "S" or rec.fields > 1 or is_traced(nums.jac):
+    if disc.scheme.method != "S" or rec.fields > 1:
         return False
     if orders == {1}:
         return True
     if orders != {2}:
         return False
-    symbol = np.zeros((nums.jac.shape[-1], rec.dim, rec.dim))
+    if _timelike(rec):
+        return True
+    if jac is None:
+        return False
+    symbol = np.zeros((jac.shape[-1], rec.dim, rec.dim))
     for s, (_, b) in enumerate(rec.slots):
         if sum(b) == 2:
             i, j = [axis for axis in range(rec.dim) for _ in range(b[axis])]
-            symbol[:, i, j] += nums.jac[0, s, 0] / 2
-            symbol[:, j, i] += nums.jac[0, s, 0] / 2
+            symbol[:, i, j] += jac[0, s, 0] / 2
+            symbol[:, j, i] += jac[0, s, 0] / 2
     values = np.linalg.eigvalsh(symbol)
     diffusion = np.abs(values).max(axis=1)
     if (values[:, 0] * values[:, -1] < -1e-10 * diffusion**2).any():
         return True
     drift = [s for s, (_, b) in enumerate(rec.slots) if sum(b) == 1]
-    if not drift or is_traced(disc.cloud.points):
+    points = concrete(disc.cloud.points)
+    if not drift or points is None:
         return False
-    speed = np.linalg.norm(nums.jac[0, drift, 0], axis=0)
-    points = np.asarray(disc.cloud.points)
+    speed = np.linalg.norm(jac[0, drift, 0], axis=0)
+    points = np.asarray(points)
     apart = (np.prod(np.ptp(points, axis=0)) / len(points)) ** (1.0 / rec.dim)
     return bool(np.median(speed * apart / diffusion) > 2.0)
+
+
+def _timelike(rec: Recursion) -> bool:
+    """Whether an axis enters by a first derivative only, as time does in a heat equation."""
+    second = {axis for _, b in rec.slots if sum(b) == 2 for axis in range(rec.dim) if b[axis]}
+    first = {b.index(1) for _, b in rec.slots if sum(b) == 1}
+    return bool(first - second)
 
 
 def with_held(disc: Discretization, nums: Numbers, x: Any) -> Any:

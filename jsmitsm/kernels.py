@@ -104,7 +104,7 @@ class SuperGaussian(_Named):
     1.18516 for D = 1, 2, 3 is :meth:`normalization`; it cancels from every moment system.
 
     >>> import jsmitsm as js
-    >>> round(js.SuperGaussian(h=0.1, d=2.0).profile(0.0), 3)
+    >>> round(float(js.SuperGaussian(h=0.1, d=2.0).profile(0.0)), 3)
     4.0
     """
 

@@ -59,7 +59,7 @@ def stencils(cloud: Cloud, *, size: int | None = None, radius: Any = None) -> St
     --------
     >>> import jsmitsm as js
     >>> js.stencils(js.rectangle((0, 0), (1, 1), (9, 9)), size=9)
-    Stencils(81 particles, at most 9 neighbours each, themselves counted)
+    Stencils(81 particles, at most 11 neighbours each, themselves counted)
     """
     if not isinstance(cloud, Cloud):
         raise ValueError(

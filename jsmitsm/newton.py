@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm import discretize as dz
-from jsmitsm.boundary import is_traced, sample
+from jsmitsm.boundary import concrete, is_traced, sample
 from jsmitsm.errors import SolveError
 from jsmitsm.system import Run
 from jsmitsm.taylor import multi_indices
@@ -44,13 +44,6 @@ def newton(run: Run, u0: Any) -> tuple[Any, Any, Any, Any]:
 def _repeats(rate: float) -> int:
     """Steps after which the derivative's error, contracted by ``rate`` each, is below 1e-9."""
     return int(np.clip(math.ceil(math.log(1e-9) / math.log(min(max(rate, 1e-12), 0.5))), 2, 20))
-
-
-def concrete(x: Any) -> Any:
-    """The numbers behind a value that only carries derivatives; None behind an abstract one."""
-    while isinstance(x, jax.core.Tracer):
-        x = getattr(x, "primal", None)
-    return x
 
 
 def _advance(run: Run, taylor: Any) -> tuple[Any, Any]:
