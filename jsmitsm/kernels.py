@@ -17,6 +17,8 @@ EDGE = 1.0 + 1e-9
 class Kernel:
     """A radial weight function of the scaled distance r = |x - x_i| / h, zero beyond r = d.
 
+    A kernel is a pytree whose leaves are ``h``, ``d`` and ``params``, so gradients flow to them.
+
     Parameters
     ----------
     profile : function r -> weight of a scalar scaled distance, written in ``jax.numpy``;
@@ -24,8 +26,6 @@ class Kernel:
     h : smoothing length in length units, a positive scalar or an (N,) array, one per particle.
     d : dimensionless support radius; a particle has the neighbours |x - x_i| <= d h.
     params : any pytree of numbers, further parameters of the profile.
-
-    A kernel is a pytree whose leaves are ``h``, ``d`` and ``params``, so gradients flow to them.
 
     Examples
     --------

@@ -51,6 +51,7 @@ class Discretization:
     images: Images
     n_own: np.ndarray  # (N,) own conditions of each particle
     given_stencils: bool  # the user's: nothing outside them is looked at
+    repeated: int = 0  # particles whose moment system was that of another
 
     @property
     def points(self) -> Any:

@@ -166,6 +166,8 @@ def _value(value: Any, name: str) -> Any:
 class Problem:
     """A boundary-value problem.
 
+    A problem is a pytree: params and the numbers in the conditions are leaves.
+
     Parameters
     ----------
     pde : function ``(u, x)`` or ``(u, x, params)`` returning the residual at the point x (D,):
@@ -175,8 +177,6 @@ class Problem:
     fields : number F of unknown fields.
     params : any pytree of numbers. Where it is given, every function of the problem takes it as
         its last argument, and new numbers in it never recompile.
-
-    A problem is a pytree: params and the numbers in the conditions are leaves.
 
     Examples
     --------

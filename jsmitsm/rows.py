@@ -18,6 +18,7 @@ from jsmitsm.layout import Class, Discretization
 from jsmitsm.moments import Elimination, Row, Scheme
 from jsmitsm.neighbours import nearest, within
 from jsmitsm.numbers import Numbers
+from jsmitsm.repeats import repeats
 
 
 def operands(disc: Discretization, nums: Numbers, ids: np.ndarray, scheme: Scheme, shared: Any) -> Operands:
@@ -49,7 +50,23 @@ def all_rows(disc: Discretization, nums: Numbers) -> tuple[list[Class], list[Row
     shared = shared_elimination(disc, nums)
     if disc.scheme.method in ("I", "II"):
         return _two_stage_rows(disc, nums, shared)
-    return disc.classes, [class_rows(disc, nums, cls, shared) for cls in disc.classes]
+    made = [_once_each(disc, nums, cls, shared) for cls in disc.classes]
+    return [cls for cls, _ in made], [row for _, row in made]
+
+
+def _once_each(disc: Discretization, nums: Numbers, cls: Class, shared: Any) -> tuple[Class, Row]:
+    """The rows of a class; repeated stencils of a constant operator are set up once."""
+    own = operands(disc, nums, cls.ids, cls.scheme, shared).own
+    one_size = disc.kernel is None or (not is_traced(disc.kernel) and np.ndim(disc.kernel.h) == 0)
+    if not one_size or nums.jac.shape[-1] > 1 or cls.scheme.n_data or is_traced(cls.neighbours, disc.points, own):
+        return cls, class_rows(disc, nums, cls, shared)
+    found = repeats(np.asarray(disc.points), cls.ids, cls.neighbours, np.asarray(own))
+    if found is None:
+        return cls, class_rows(disc, nums, cls, shared)
+    disc.repeated += len(cls.ids) - len(found.first)
+    few = Class(cls.ids[found.first], found.neighbours[found.first], cls.scheme)
+    row = class_rows(disc, nums, few, shared)
+    return replace(cls, neighbours=found.neighbours), jax.tree.map(lambda x: x[found.of], row)
 
 
 def _two_stage_rows(disc: Discretization, nums: Numbers, shared: Any) -> tuple[list[Class], list[Row]]:

@@ -41,7 +41,7 @@ def continuation(
     >>> bratu = lambda c: js.Problem(lambda u, x: js.laplacian(u)(x) + c * jnp.exp(u(x)), ends)
     >>> sols = js.continuation(bratu, js.interval(0.0, 1.0, 21), [1.0, 2.0, 3.0])
     >>> [round(float(sol.u[10]), 4) for sol in sols]
-    [0.1405, 0.3289, 0.6473]
+    [0.1405, 0.329, 0.6401]
     """
     values = np.asarray(parameters, float)
     if values.ndim != 1 or len(values) < 2 or not np.isfinite(values).all():

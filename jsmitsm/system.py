@@ -196,6 +196,8 @@ def skipped(disc: Discretization) -> list[str]:
         out.append("kernel derivatives")
     if traced.constant and disc.rec.scale_free:
         out.append("recursion per particle")
+    if disc.repeated:
+        out.append(f"moment systems of {disc.repeated} particles with repeated stencils")
     if traced.source == "zero":
         out.append("particular part")
     if disc.held.all(axis=1).any():
