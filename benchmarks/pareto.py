@@ -175,12 +175,15 @@ def _reach(scene: Scene, cloud: js.Cloud, method: str, order: int) -> float:
 
 def theirs(run: Callable[[peers.Posed], np.ndarray]) -> Callable[[Scene, js.Cloud, Any], Callable[[js.Cloud], Any]]:
     def prepare(scene, cloud, size):
-        numbers = posed(scene, cloud, size)
+        ready = {}
 
-        def call(moved):
-            numbers.points = np.asarray(moved.points)
-            return run(numbers)
+        def call(cloud):
+            return run(ready[id(cloud)])
 
+        def numbers(cloud):
+            ready[id(cloud)] = posed(scene, cloud, size)
+
+        call.numbers = numbers
         return call
 
     return prepare
@@ -211,11 +214,11 @@ def contestants(scene: Scene) -> Iterator[tuple[str, Any]]:
 def measure(scene: Scene, make: Any, size: Any) -> dict[str, Any] | None:
     """Error, first call and median of the repeats; None where the contestant refuses the cloud."""
     cloud = scene.cloud(size)
-    exact = np.array(jax.vmap(scene.exact)(jnp.asarray(cloud.points)))
     call = make(scene, cloud, size)
     seconds = []
     for k in range(REPEATS + 1):
         other = moved(cloud, k, scene)
+        getattr(call, "numbers", lambda _: None)(other)
         start = time.perf_counter()
         try:
             u = np.asarray(jax.block_until_ready(call(other)))
@@ -224,6 +227,7 @@ def measure(scene: Scene, make: Any, size: Any) -> dict[str, Any] | None:
         seconds.append(time.perf_counter() - start)
         if seconds[0] > PATIENCE or sum(seconds) > 3 * PATIENCE:
             break
+    exact = np.array(jax.vmap(scene.exact)(jnp.asarray(other.points)))
     error = float(np.linalg.norm(u - exact) / np.linalg.norm(exact))
     warm = float(np.median(seconds[1:])) if len(seconds) > 1 else None
     return {"particles": len(cloud), "error": error, "first": seconds[0], "warm": warm, "repeats": len(seconds) - 1}

@@ -28,9 +28,16 @@ def continuation(
     parameters : the stages, in the order in which to go; two or more.
     u0 : start of the first stage, as in :func:`jsmitsm.solve`; ``options`` are passed to it.
 
-    Returns the solutions at ``parameters``. Where Newton's method fails, the way to the next
-    parameter is halved; SolveError with the last parameter reached if that does not help, as at a
-    turning point, beyond which there is no solution.
+    Returns
+    -------
+    list of Solution : one for each of ``parameters``. Where Newton's method fails, the way to the
+        next parameter is halved.
+
+    Raises
+    ------
+    SolveError
+        With the last parameter reached if halving does not help, as at a turning point, beyond
+        which there is no solution.
 
     Examples
     --------

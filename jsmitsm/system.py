@@ -46,7 +46,10 @@ class Run:
             disc.classes = classes
             self._tell_repairs()
         else:
+            before = self.health
             self.health = health.examine(classes, rows)
+            if before is not None:  # Newton's later steps keep the stencils of the first
+                self.health.repaired = before.repaired
         bad = self.health.undetermined
         if len(bad):
             self.fail(
