@@ -7,7 +7,7 @@ is fixed by the stencils and known before.
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial, wraps
+from functools import wraps
 from typing import Any, NamedTuple
 
 import jax
@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm import closure, moments
+from jsmitsm.boundary import is_traced
 from jsmitsm.closure import Recovery
 from jsmitsm.kernels import Kernel
 from jsmitsm.moments import Block, Elimination, Row, Scheme, Support
@@ -22,6 +23,10 @@ from jsmitsm.recursion import row_levels
 
 # Particles per block: larger blocks leave the cache and are several times slower.
 _BLOCK = 64
+# So few particles are always padded to as many, and their programs compiled without optimisation:
+# that takes half the time, and what it costs in running is less than a millisecond.
+_FEW = 128
+_QUICKLY = {"xla_backend_optimization_level": 0}
 
 # How often the local phase was compiled; read by the tests.
 TRACES = {"rows": 0, "coefficients": 0}
@@ -45,8 +50,8 @@ class Operands(NamedTuple):
 def padded_size(n: int) -> int:
     """The size class of n particles: shapes repeat between clouds of similar size, so that a
     compiled program serves the next cloud too; at most one part in eight is wasted."""
-    if n <= _BLOCK:
-        return max(8, 1 << (n - 1).bit_length())
+    if n <= _FEW:
+        return _FEW
     step = max(_BLOCK, 1 << ((n - 1).bit_length() - 4))
     return -(-n // step) * step
 
@@ -60,8 +65,10 @@ def _pad(x: Any, n: int, size: int) -> Any:
 
 
 def _in_size_classes(function: Any) -> Any:
-    """Call ``function(scheme, points, kernel, ids, neighbours, operands, each, whole)`` with every
-    particle axis padded: that of ``ids``, and that of the cloud."""
+    """Compile ``function(scheme, points, kernel, ids, neighbours, operands, each, whole)``, and call it
+    with every particle axis padded: that of ``ids``, and that of the cloud."""
+    program = jax.jit(function, static_argnums=(0,))
+    quick = jax.jit(function, static_argnums=(0,), compiler_options=_QUICKLY)
 
     @wraps(function)
     def padded(scheme, points, kernel, ids, neighbours, operands, each=(), whole=()):
@@ -71,10 +78,12 @@ def _in_size_classes(function: Any) -> Any:
         class_wide = lambda tree: jax.tree.map(lambda x: _pad(x, m, size), tree)  # noqa: E731
         jac = operands.jac if operands.jac.shape[0] == 1 else class_wide(operands.jac)
         given = Operands(jac, class_wide(operands.own), cloud_wide(operands.data), operands.shared)
-        made = function(
-            scheme, cloud_wide(points), cloud_wide(kernel), class_wide(ids), class_wide(neighbours), given,
+        arguments = (
+            cloud_wide(points), cloud_wide(kernel), class_wide(ids), class_wide(neighbours), given,
             class_wide(each), cloud_wide(whole),
         )  # fmt: skip
+        # An inner program has no options of its own.
+        made = (quick if size <= _FEW and not is_traced(arguments) else program)(scheme, *arguments)
         # Cut on the host where nothing is traced: an eager slice would compile for every length.
         return jax.tree.map(lambda x: (x if isinstance(x, jax.core.Tracer) else np.asarray(x))[:m], made)
 
@@ -82,7 +91,6 @@ def _in_size_classes(function: Any) -> Any:
 
 
 @_in_size_classes
-@partial(jax.jit, static_argnums=(0,))
 def rows(
     scheme: Scheme, points: Any, kernel: Kernel | None, ids: Any, neighbours: Any, operands: Operands,
     each: tuple = (), whole: tuple = (),
@@ -97,7 +105,6 @@ def rows(
 
 
 @_in_size_classes
-@partial(jax.jit, static_argnums=(0,))
 def coefficients(
     scheme: Scheme, points: Any, kernel: Kernel | None, ids: Any, neighbours: Any, operands: Operands,
     each: tuple[Any, Any], whole: tuple[Any, Any],
@@ -120,7 +127,6 @@ def coefficients(
 
 
 @_in_size_classes
-@partial(jax.jit, static_argnums=(0,))
 def blocks(
     scheme: Scheme, points: Any, kernel: Kernel | None, ids: Any, neighbours: Any, operands: Operands,
     each: tuple[Any, Any], whole: tuple = (),
@@ -178,7 +184,6 @@ def _tests(scheme: Scheme, near: Support) -> Any:
 
 
 @_in_size_classes
-@partial(jax.jit, static_argnums=(0,))
 def recoveries(
     scheme: Scheme, points: Any, kernel: Kernel, ids: Any, neighbours: Any, operands: Operands,
     each: tuple[Any, Any], whole: tuple = (),
@@ -197,7 +202,6 @@ def recoveries(
 
 
 @_in_size_classes
-@partial(jax.jit, static_argnums=(0,))
 def closed_rows(
     scheme: Scheme, points: Any, kernel: Kernel, ids: Any, neighbours: Any, operands: Operands,
     each: tuple[Any], whole: tuple[Any, Recovery],

@@ -196,7 +196,8 @@ def maps(cloud: Cloud, numbers: np.ndarray, anywhere: Callable | None, at: Mappi
     size = (3.6, 3.4) if many else page(np.asarray(cloud.points))
     drawn = panels(given, len(pieces), size)
     for ax, (xy, triangles, z), (axis, position) in zip(drawn, pieces, _places(cloud, at)):
-        z = np.clip(z, bounds[0], bounds[-1])
+        # Matplotlib leaves white what lies on the highest level.
+        z = np.clip(z, bounds[0], bounds[-1] - 1e-9 * (bounds[-1] - bounds[0]))
         filled = ax.tricontourf(*xy.T, triangles, z, levels=bounds, cmap="cividis" if log else "viridis")
         ax.set_aspect("equal")
         names = [n for k, n in enumerate(_NAMES[: cloud.dim]) if k != axis]

@@ -138,7 +138,8 @@ def sorted_classes(disc: Discretization, ids: np.ndarray, stencils: Stencils) ->
         counts = np.max(np.where(near[ids] >= 0, np.arange(near.shape[1]), 0), axis=1, initial=0) + 1
         narrow = int(np.quantile(counts, 0.8)) if len(ids) else 1
         wide = counts > 1.25 * narrow
-        used = [int(counts[~wide].max(initial=1)), near.shape[1]]
+        used = [_rounded(int(counts[~wide].max(initial=1))), _rounded(near.shape[1])]
+        near = np.pad(near, ((0, 0), (0, max(0, max(used) - near.shape[1]))), constant_values=-1)
     classes = []
     for count in np.unique(disc.n_own[ids]):
         for some in (ids[(disc.n_own[ids] == count) & (wide == k)] for k in (False, True)):
@@ -146,6 +147,11 @@ def sorted_classes(disc: Discretization, ids: np.ndarray, stencils: Stencils) ->
                 width = used[int(wide[np.searchsorted(ids, some[0])])]
                 classes.append(Class(some, near[some][:, :width], replace(disc.scheme, n_own=int(count))))
     return classes
+
+
+def _rounded(width: int) -> int:
+    """Widths of stencils come in steps, so that another support seldom needs another program."""
+    return width if width <= 5 else -(-width // 4) * 4
 
 
 def table(disc: Discretization) -> Any:

@@ -39,10 +39,10 @@ class Condition:
         return cls(kind, field, **dict(zip(names, leaves)), **dict(static))
 
     def __repr__(self) -> str:
-        shown = [
-            f"{k}=<function>" if callable(v) else f"{k}=array{np.shape(v)}" if np.ndim(v) else f"{k}={v}"
-            for k, v in self.parts.items()
-        ]
+        def short(v: Any) -> str:
+            return "<function>" if callable(v) else f"array{v.shape}" if np.ndim(v) and hasattr(v, "shape") else str(v)
+
+        shown = [f"{k}={short(v)}" for k, v in self.parts.items()]
         return f"{self.kind}({', '.join(shown + ([f'field={self.field}'] if self.field is not None else []))})"
 
 
