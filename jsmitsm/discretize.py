@@ -4,7 +4,17 @@
 moment systems, ``globalsystem`` joins them.
 """
 
-from jsmitsm.globalsystem import least_squares, matrix, prefers_least_squares, right_side, with_held
+from jsmitsm.globalsystem import (
+    cell_peclet,
+    least_squares,
+    matrix,
+    mean_spacing,
+    misfit,
+    prefers_least_squares,
+    right_side,
+    wave_number,
+    with_held,
+)
 from jsmitsm.layout import Class, Discretization, default_size, discretize, scheme_size, sorted_classes, table
 from jsmitsm.numbers import Numbers, numbers
 from jsmitsm.rows import all_coefficients, all_rows, class_rows, shared_elimination
@@ -15,11 +25,14 @@ __all__ = [
     "Numbers",
     "all_coefficients",
     "all_rows",
+    "cell_peclet",
     "class_rows",
     "default_size",
     "discretize",
     "least_squares",
     "matrix",
+    "mean_spacing",
+    "misfit",
     "numbers",
     "prefers_least_squares",
     "right_side",
@@ -27,5 +40,6 @@ __all__ = [
     "shared_elimination",
     "sorted_classes",
     "table",
+    "wave_number",
     "with_held",
 ]

@@ -149,11 +149,15 @@ class Factorization:
     def _finish(self, problem: Problem, nums: Numbers | None) -> Solution:
         nums = self._nums if nums is None else nums
         disc = self._disc
-        x, good = self._run.solved(*self._matrix, dz.right_side(disc, nums, self._classes, self._rows))
+        run = self._run
+        x, good = run.solved(*self._matrix, dz.right_side(disc, nums, self._classes, self._rows))
         values = dz.with_held(disc, nums, x)
+        run.rows, run.nums, run.values = (self._classes, self._rows), nums, np.asarray(values)
+        for name in ("factor", "misfit"):
+            run.__dict__.pop(name, None)
         recipe = Recipe(disc.scheme.method, disc.rec.order, None, "loo", problem.fields)
         fit = Fit(problem, disc.cloud, disc.kernel, dz.table(disc), None, recipe)
-        return Solution(values, disc.cloud, recipe, fit, good, 1, self._run.stats())
+        return Solution(values, disc.cloud, recipe, fit, good, 1, run.stats(), report=run.flags)
 
     def __repr__(self) -> str:
         return f"Factorization({int((~self._disc.held).sum())} unknowns, method={self._disc.scheme.method!r})"

@@ -78,8 +78,19 @@ def right_side(disc: Discretization, nums: Numbers, classes: list[Class], rows: 
     return xp.concatenate(parts)[order] if parts else np.zeros(0)
 
 
-def least_squares(disc: Discretization, nums: Numbers) -> tuple[Any, Any, Any, Any]:
+def misfit(disc: Discretization, nums: Numbers, fits: list[Any], values: Any) -> np.ndarray:
+    """By how much each particle's value misses its local fit, in the blocks of :func:`least_squares`."""
+    found = []
+    for near, own, load, extra in fits:
+        data = np.concatenate([np.asarray(values)[np.maximum(near, 0)].reshape(len(near), -1), extra], axis=1)
+        found.append(np.abs(np.einsum("nij,nj->ni", own, data) - load).max(axis=1))
+    return np.concatenate(found)
+
+
+def least_squares(disc: Discretization, nums: Numbers, fits: list[Any] | None = None) -> tuple[Any, Any, Any, Any]:
     """The normal equations of the least-squares form, as coordinates, and their right-hand side.
+
+    A list ``fits`` is filled with what :func:`misfit` needs, where nothing is traced.
 
     Every particle contributes the misfit of its local fit, those with held values too: the
     projector of a fit is idempotent, so nothing is squared.
@@ -104,6 +115,9 @@ def least_squares(disc: Discretization, nums: Numbers) -> tuple[Any, Any, Any, A
         given_data = xp.concatenate([known, extra], axis=1)
         m = place.shape[1]
         matrix, load = xp.asarray(made.matrix), xp.asarray(made.load)
+        if fits is not None and xp is np:
+            own = slice(0, disc.rec.fields)
+            fits.append((near, matrix[:, own].copy(), load[:, own].copy(), extra))
         right = (load - xp.einsum("nij,nj->ni", matrix, given_data))[:, :m]
         r = xp.broadcast_to(place[:, :, None], (len(cls.ids), m, m))
         c = xp.broadcast_to(place[:, None, :], (len(cls.ids), m, m))
@@ -165,6 +179,42 @@ def _timelike(rec: Recursion) -> bool:
     second = {axis for _, b in rec.slots if sum(b) == 2 for axis in range(rec.dim) if b[axis]}
     first = {b.index(1) for _, b in rec.slots if sum(b) == 1}
     return bool(first - second)
+
+
+def cell_peclet(disc: Discretization, nums: Numbers) -> float:
+    """Convection over diffusion between neighbours, the median over the particles; 0 where it has no meaning."""
+    rec = disc.rec
+    drift = [s for s, (_, b) in enumerate(rec.slots) if sum(b) == 1]
+    second = [s for s, (_, b) in enumerate(rec.slots) if sum(b) == 2]
+    orders = {rec.order - q for q in rec.degrees}
+    if rec.fields > 1 or orders != {2} or not drift or not second or is_traced(nums.jac, disc.cloud.points):
+        return 0.0
+    jac = np.asarray(nums.jac)[0, :, 0]
+    speed, diffusion = np.linalg.norm(jac[drift], axis=0), np.abs(jac[second]).max(axis=0)
+    return float(np.median(speed * mean_spacing(disc) / np.where(diffusion > 0, diffusion, np.inf)))
+
+
+def mean_spacing(disc: Discretization) -> float:
+    """The edge of the cube that each particle has for itself."""
+    points = np.asarray(disc.cloud.points)
+    return float((np.prod(np.ptp(points, axis=0)) / len(points)) ** (1.0 / disc.rec.dim))
+
+
+def wave_number(disc: Discretization, nums: Numbers) -> float:
+    """k of an operator such as laplacian(u) + k^2 u, the median over the particles; 0 where it has no waves."""
+    rec = disc.rec
+    zero = [s for s, (_, b) in enumerate(rec.slots) if sum(b) == 0]
+    pure = [s for s, (_, b) in enumerate(rec.slots) if sum(b) == 2 and max(b) == 2]
+    orders = {rec.order - q for q in rec.degrees}
+    if rec.fields > 1 or orders != {2} or not zero or not pure or is_traced(nums.jac, disc.cloud.points):
+        return 0.0
+    jac = np.asarray(nums.jac)[0, :, 0]
+    second = jac[pure]
+    # A wave equation in space and time has second derivatives of both signs: another matter.
+    if (second.min(axis=0) * second.max(axis=0) <= 0).any():
+        return 0.0
+    square = np.median(jac[zero[0]] / second[np.argmax(np.abs(second), axis=0), np.arange(second.shape[1])])
+    return float(np.sqrt(max(square, 0.0)))
 
 
 def with_held(disc: Discretization, nums: Numbers, x: Any) -> Any:

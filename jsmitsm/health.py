@@ -40,11 +40,16 @@ def examine(classes: list[Class], rows: list[Row]) -> Health:
     health = Health()
     for cls, row in zip(classes, rows):
         lebesgue, defect = _worst(row)
-        bad = ~np.isfinite(lebesgue) | ~(defect < DEFECT)
+        bad = ~np.isfinite(lebesgue) | ~(defect < _most(row))
         health.undetermined = np.append(health.undetermined, cls.ids[bad])
         health.weak = np.append(health.weak, cls.ids[lebesgue > LEBESGUE])
         health.largest = max(health.largest, float(np.max(lebesgue[~bad], initial=1.0)))
     return health
+
+
+def _most(row: Row) -> float:
+    """The largest defect that round-off explains: in float32 a moment system keeps three digits."""
+    return max(DEFECT, 1e4 * float(np.finfo(np.asarray(row.weights).dtype).eps))
 
 
 def _worst(row: Row) -> tuple[np.ndarray, np.ndarray]:
@@ -96,7 +101,7 @@ def repaired(
 
 def _score(row: Row) -> np.ndarray:
     lebesgue, defect = _worst(row)
-    return np.where(np.isfinite(lebesgue) & (defect < DEFECT), lebesgue, np.inf)
+    return np.where(np.isfinite(lebesgue) & (defect < _most(row)), lebesgue, np.inf)
 
 
 class _Best:

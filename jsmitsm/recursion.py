@@ -67,6 +67,11 @@ class Recursion:
         return len(_rows(self))
 
     @property
+    def row_index(self) -> list[tuple[int, tuple[int, ...]]]:
+        """The equation and the multi-index of the residual's coefficient behind each row."""
+        return _rows(self)
+
+    @property
     def scale_free(self) -> bool:
         """Whether constant coefficients give the same constraints at every length scale."""
         return all(

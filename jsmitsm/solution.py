@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -14,6 +15,9 @@ from jsmitsm.boundary import is_traced
 from jsmitsm.clouds import Cloud
 from jsmitsm.polynomials import derivative_table, monomials
 from jsmitsm.taylor import multi_indices
+
+# An estimated error above this part of the solution is a flag.
+LARGE = 0.1
 
 
 @dataclass(frozen=True)
@@ -43,7 +47,7 @@ class Solution:
     A solution is a pytree: it passes through ``jax.jit``, ``jax.grad`` and ``pickle``.
     """
 
-    def __init__(self, values, cloud, recipe, fit, converged, iterations, stats, fitted=None):
+    def __init__(self, values, cloud, recipe, fit, converged, iterations, stats, fitted=None, report=None):
         self._values = values  # (N, F)
         self.cloud: Cloud = cloud
         self._recipe: Recipe = recipe
@@ -52,6 +56,9 @@ class Solution:
         self.converged = converged
         self.iterations = iterations
         self.stats: dict[str, Any] = stats
+        self._report: Callable[[], list[str]] | None = report
+        self._found: list[str] | None = None  # what the report said
+        self._share = 0.0  # estimated error over solution
 
     @property
     def method(self) -> str:
@@ -136,7 +143,23 @@ class Solution:
         """
         from jsmitsm.estimate import error_estimate
 
-        return error_estimate(self)
+        error = error_estimate(self)
+        if not is_traced(error, self._values):
+            self._share = float(np.linalg.norm(error) / (np.linalg.norm(self.u) or 1.0))
+        return error
+
+    @property
+    def flags(self) -> list[str]:
+        """What speaks against this solution, a sentence each; none for a healthy one.
+
+        Tested when first asked for: roughness between neighbours, near singularity, an unresolved
+        source, hopeless stencils, misfits of the equation; and the error estimate, where it was
+        asked for before. No flag is no proof; the error estimate sees more.
+        """
+        if self._found is None and self._report is not None:
+            self._found = self._report()
+        large = f"The estimated error is {self._share:.0%} of the solution: refine the cloud, or change the order."
+        return [*(self._found or []), *([] if self._share <= LARGE else [large])]
 
     def diagnose(self) -> str:
         """In words: how the solve went, which particles were weak and what was done."""
@@ -144,6 +167,7 @@ class Solution:
         lines = [repr(self)]
         if not bool(self.converged):
             lines.append("The solve did NOT converge; do not trust these values.")
+        lines += [f"FLAG: {line}" for line in self.flags if not line.startswith("FAILED")]
         lines += [str(line) for line in s.get("messages", [])]
         if "lebesgue_max" in s:
             lines.append(f"Largest Lebesgue constant {s['lebesgue_max']:.3g} (up to 1.5 is healthy).")
@@ -165,12 +189,13 @@ class Solution:
         new._values, new.cloud, new._fit, new._fitted, new.converged, new.iterations = leaves
         new._recipe = recipe
         new.stats = {}
+        new._report, new._found, new._share = None, None, 0.0
         return new
 
     def __getstate__(self):
         # The user's functions need not pickle: what they give, the local polynomials, does.
         fitted = jax.tree.map(np.asarray, self._taylor)
-        return {**self.__dict__, "_fit": None, "_fitted": fitted}
+        return {**self.__dict__, "_fit": None, "_fitted": fitted, "_found": self.flags, "_report": None}
 
 
 def _checked_points(points: Any, dim: int) -> Any:

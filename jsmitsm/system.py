@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from functools import cached_property
 from typing import Any
 
 import jax.numpy as jnp
@@ -13,6 +14,7 @@ from jsmitsm import health, linsolve
 from jsmitsm.boundary import is_traced
 from jsmitsm.discretize import Class, Discretization, Numbers
 from jsmitsm.errors import SolveError
+from jsmitsm.flags import flags
 from jsmitsm.moments import Row
 from jsmitsm.problem import Problem
 
@@ -33,7 +35,10 @@ class Run:
         self.messages: list[str] = []
         self.linear: dict[str, Any] = {}
         self.health: health.Health | None = None
+        # What the last step leaves for the flags; nothing of it under a JAX transform.
         self.rows: tuple[list[Class], list[Row]] | None = None
+        self.nums: Numbers | None = None
+        self.values: np.ndarray | None = None
 
     def local_rows(self, nums: Numbers) -> tuple[list[Class], list[Row]]:
         """The rows of all classes, weak stencils repaired the first time."""
@@ -88,7 +93,7 @@ class Run:
             data, r, c, b = dz.least_squares(disc, nums)
             t1 = t2 = clock()
         else:
-            classes, rows = self.local_rows(nums)
+            self.rows = classes, rows = self.local_rows(nums)
             t1 = clock()
             data, r, c = dz.matrix(disc, classes, rows)
             b = dz.right_side(disc, nums, classes, rows)
@@ -99,6 +104,7 @@ class Run:
             self.seconds[name] += took
         if is_traced(values):
             return values, jnp.isfinite(values).all()
+        self.nums, self.values = nums, values
         return values, bool(good and np.isfinite(values).all() and not self._failed)
 
     @property
@@ -153,6 +159,39 @@ class Run:
         points = np.asarray(disc.cloud.points)
         cells = len(points) ** (1.0 / disc.rec.dim)
         return 10.0 * float(4.0 / cells) ** max(disc.rec.order - 1, 1)
+
+    @cached_property
+    def factor(self) -> linsolve.Factor | None:
+        """The factors of the last step's system, most often still kept; None where it was solved by iteration."""
+        if self.linear.get("backend") in ("amg", "ilu") or self.nums is None:
+            return None
+        disc = self.disc
+        if self.formulation == "lsq":
+            data, r, c, b = dz.least_squares(disc, self.nums)
+        else:
+            assert self.rows is not None
+            data, r, c = dz.matrix(disc, *self.rows)
+            b = np.zeros(int((~disc.held).sum()))
+        free = np.flatnonzero(~disc.held.reshape(-1))
+        fields = disc.rec.fields
+        points = np.asarray(disc.cloud.points)[free // fields]
+        if disc.floating:
+            data, r, c, b, points = _bordered(data, r, c, b, points, free % fields, disc.floating)
+        return linsolve.factor(data, r, c, len(b), points, self.solver, fields == 1 and not disc.floating)
+
+    @cached_property
+    def misfit(self) -> np.ndarray | None:
+        """By how much each particle's value misses its local fit, in the least-squares form."""
+        if self.formulation != "lsq" or self.nums is None:
+            return None
+        fits: list[Any] = []
+        dz.least_squares(self.disc, self.nums, fits)
+        return dz.misfit(self.disc, self.nums, fits, self.values)
+
+    def flags(self) -> list[str]:
+        """What speaks against the solution, in sentences; see :mod:`jsmitsm.flags`."""
+        failed = [m for m in self.messages if m.startswith("FAILED")]
+        return failed if self.values is None or self.nums is None else flags(self, self.values, self.nums)[0] + failed
 
     def stats(self) -> dict[str, Any]:
         """What a user may want to know about the solve."""

@@ -1,0 +1,201 @@
+"""What a finished solve says against itself: cheap tests, and a sentence for each that fails.
+
+Nothing here costs a moment system: some solves with the kept factors and sums over neighbours.
+A healthy solution has no flags. A flag is no proof of an error, nor its absence one of accuracy:
+the error estimate (:meth:`Solution.error_estimate`) sees more and costs more.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from jsmitsm import discretize as dz
+from jsmitsm import linsolve
+from jsmitsm.health import LEBESGUE
+
+# A particle may differ from the linear function through its neighbours by this part of the
+# range; a sine of six particles a wavelength differs by 0.25. By order: up to 3, and above.
+ROUGH = (0.2, 0.3)
+# A matrix of order m on n particles in D dimensions has a condition of about n^(m/D); so many
+# times more is nearly singular.
+SINGULAR = 1e3
+# The part of the solution that hangs on what the cloud does not resolve of the source.
+SOURCE = 0.3
+# Weights that sum to this amplify any roughness of the neighbours; a share of FEW does no harm.
+WEAK, FEW = 10.0, 0.01
+# Least squares: misfit of the local fits, added up across the domain, in parts of the range.
+# Measured: below 5e-4 where the solution is resolved, above 0.06 where a layer is not.
+MISFIT = 0.01
+# Convection over diffusion between neighbours from which methods I and II lose the solution.
+PECLET = 1.0
+# Round-off of the moment systems times the condition: this leaves two digits.
+ROUND_OFF = 1e-2
+# (k s)^(p+1) cells, with s the spacing: the phase error a wave gathers across the domain. By order, as above.
+PHASE = (0.9, 3.5)
+
+
+def flags(run: Any, values: Any, nums: Any) -> tuple[list[str], dict[str, float]]:
+    """Sentences, none for a healthy solution, and the measures behind them."""
+    values = np.asarray(values, float)
+    if not np.isfinite(values).all():
+        return ["The values are not finite."], {}
+    out: list[str] = []
+    found: dict[str, float] = {}
+    for test in (_roughness, _condition, _source, _weakness, _misfit, _peclet, _waves):
+        test(run, values, nums, out, found)
+    return out, found
+
+
+def _roughness(run: Any, values: np.ndarray, nums: Any, out: list[str], found: dict[str, float]) -> None:
+    disc = run.disc
+    points = np.asarray(disc.cloud.points, float)
+    rough = np.zeros(len(values))
+    for f in range(values.shape[1]):
+        spread = float(np.ptp(values[:, f])) or 1.0
+        away = np.abs(values[:, f] - predicted(points, values[:, f])) / spread
+        rough = np.maximum(rough, np.where(disc.held[:, f], 0.0, away))
+    found["roughness"] = float(rough.max(initial=0.0))
+    bad = np.flatnonzero(rough > ROUGH[disc.rec.order > 3])
+    if len(bad):
+        out.append(
+            f"The values change by up to {rough.max():.0%} of their range between neighbours, at {len(bad)} "
+            f"particle(s), first {_some(bad)}: a layer, a jump or a wave finer than the cloud; refine it there."
+        )
+
+
+def predicted(points: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Each particle's value from the linear function that fits its 2 D + 1 nearest neighbours best."""
+    from scipy.spatial import cKDTree
+
+    n, dim = points.shape
+    k = min(2 * dim + 2, n)
+    if k < dim + 3:
+        return values
+    near = cKDTree(points).query(points, k=k)[1][:, 1:]
+    offset = points[near] - points[:, None]
+    size = np.sqrt((offset**2).sum(axis=2)).max(axis=1)
+    p = np.concatenate([np.ones((n, k - 1, 1)), offset / size[:, None, None]], axis=2)
+    # A little ridge: neighbours on one line say nothing of the slope across it.
+    gram = np.einsum("nki,nkj->nij", p, p) + 1e-6 * np.eye(dim + 1)
+    return np.linalg.solve(gram, np.einsum("nki,nk->ni", p, values[near])[..., None])[:, 0, 0]
+
+
+def _condition(run: Any, values: np.ndarray, nums: Any, out: list[str], found: dict[str, float]) -> None:
+    if run.factor is None:
+        return
+    rec = run.disc.rec
+    order = max(rec.order - q for q in rec.degrees)
+    found["condition"] = linsolve.condition_estimate(run.factor)
+    usual = len(values) ** (order / rec.dim)
+    if found["condition"] > SINGULAR * usual:
+        out.append(
+            f"The global system is nearly singular (condition {found['condition']:.1e}, {usual:.0e} is usual): the "
+            "operator is near a resonance, particles nearly coincide, or the supports couple them badly."
+        )
+    if run.rows is None:
+        return
+    defect = max(float(np.max(np.asarray(row.defect), initial=0.0)) for row in run.rows[1])
+    found["round_off"] = defect * found["condition"]
+    if found["round_off"] > ROUND_OFF:
+        single = any(np.asarray(row.weights).dtype == np.float32 for row in run.rows[1])
+        out.append(
+            f"Round-off may reach {found['round_off']:.0e} of the solution: "
+            + ('enable float64 with jax.config.update("jax_enable_x64", True).' if single else "widen the supports.")
+        )
+
+
+def _source(run: Any, values: np.ndarray, nums: Any, out: list[str], found: dict[str, float]) -> None:
+    """How much of the solution the unresolved part of the source makes: one solve with it alone."""
+    disc, rec = run.disc, run.disc.rec
+    if run.factor is None or run.rows is None or not disc.linear or np.shape(nums.source)[-1] < 2:
+        return
+    source = np.array(nums.source, float)
+    part = np.zeros_like(source)
+    if rec.degree >= 2 and disc.scheme.method != "SSPH":
+        # The last two degrees: on a symmetric stencil one of them has no weight.
+        last = [k for k, (e, c) in enumerate(rec.row_index) if sum(c) > rec.degrees[e] - 2]
+        part[last] = source[last]
+    else:
+        points = np.asarray(disc.cloud.points, float)[nums.ids]
+        for k in rec.equation_rows:
+            # Its size: what alternates from particle to particle must not cancel.
+            part[k] = np.abs(source[k] - predicted(points, source[k]))
+    zero = np.zeros_like
+    alone = replace(nums, source=part, held=zero(nums.held), given=zero(nums.given), gamma=zero(nums.gamma))
+    if disc.scheme.method in ("I", "II"):
+        rows = dz.all_rows(disc, alone)[1]  # their constant part holds the neighbours' sources
+    else:
+        rows = run.rows[1]
+    right = np.asarray(dz.right_side(disc, alone, run.rows[0], rows))
+    right = np.concatenate([right, np.zeros(len(disc.floating))])
+    share = float(np.linalg.norm(run.factor.solve(right)) / (np.linalg.norm(values) or 1.0))
+    found["source"] = share
+    if share > SOURCE:
+        out.append(
+            f"The part of the source that the cloud does not resolve makes {share:.0%} of the solution: the source "
+            "is narrower than the spacing somewhere, or the operator amplifies it; refine there."
+        )
+
+
+def _weakness(run: Any, values: np.ndarray, nums: Any, out: list[str], found: dict[str, float]) -> None:
+    if run.rows is None:
+        return
+    size = np.concatenate([np.asarray(row.lebesgue).max(axis=1) for row in run.rows[1]])
+    ids = np.concatenate([cls.ids for cls in run.rows[0]])
+    found["weak"] = float((size > LEBESGUE).mean())
+    found["lebesgue50"] = float(np.median(size))
+    bad = ids[size > WEAK]
+    found["hopeless"] = len(bad) / len(ids)
+    if len(bad) > FEW * len(ids):
+        out.append(
+            f"{len(bad)} particle(s), first {_some(bad)}, amplify their neighbours' errors up to {size.max():.1e} "
+            "times (Lebesgue constant, up to 1.5 is healthy): choose a support with more, or more evenly spread, "
+            "particles, or leave kernel out."
+        )
+
+
+def _misfit(run: Any, values: np.ndarray, nums: Any, out: list[str], found: dict[str, float]) -> None:
+    if run.misfit is None:
+        return
+    spread = float(np.ptp(values)) or 1.0
+    cells = len(values) ** (1.0 / run.disc.rec.dim)
+    found["misfit"] = float(np.sqrt(np.mean(run.misfit**2)) * cells / spread)
+    if found["misfit"] > MISFIT:
+        out.append(
+            f"No function fits the equation and the conditions on this cloud: the misfit adds up to "
+            f"{found['misfit']:.0%} of the range, as where a layer is thinner than the spacing; refine at the outflow."
+        )
+
+
+def _peclet(run: Any, values: np.ndarray, nums: Any, out: list[str], found: dict[str, float]) -> None:
+    disc = run.disc
+    found["peclet"] = cell = dz.cell_peclet(disc, nums)
+    if cell > PECLET and disc.scheme.method in ("I", "II"):
+        out.append(
+            f"Convection is {cell:.1f} times diffusion between neighbours, for which method {disc.scheme.method} is "
+            'not made: use method="S", or refine.'
+        )
+
+
+def _waves(run: Any, values: np.ndarray, nums: Any, out: list[str], found: dict[str, float]) -> None:
+    """Waves of an operator such as laplacian(u) + k^2 u: few particles per wavelength put their phase out."""
+    disc = run.disc
+    k = dz.wave_number(disc, nums)
+    if not k:
+        return
+    order = disc.rec.order
+    cells = len(values) ** (1.0 / disc.rec.dim)
+    spacing = dz.mean_spacing(disc)
+    found["wave"] = float(cells * (k * spacing) ** (2 * (order // 2) + 1))
+    if found["wave"] > PHASE[order > 3]:
+        out.append(
+            f"The operator has waves of {2 * np.pi / (k * spacing):.1f} particles a length, too few for order {order} "
+            f"over {cells:.0f} particles: their phase is lost; refine, or raise the order."
+        )
+
+
+def _some(index: Any, most: int = 6) -> str:
+    return f"[{', '.join(str(int(i)) for i in index[:most])}{', ...' if len(index) > most else ''}]"

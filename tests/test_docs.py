@@ -1,0 +1,67 @@
+"""Every Python block under docs/ runs, page by page, and so does every example in a docstring."""
+
+import doctest
+import importlib
+import pkgutil
+import re
+from pathlib import Path
+
+import pytest
+
+import jsmitsm
+
+DOCS = Path(__file__).parent.parent / "docs"
+MODULES = sorted(m.name for m in pkgutil.iter_modules(jsmitsm.__path__))
+
+
+@pytest.fixture(autouse=True)
+def no_windows():
+    matplotlib = pytest.importorskip("matplotlib")
+    matplotlib.use("Agg")
+    yield
+    importlib.import_module("matplotlib.pyplot").close("all")
+
+
+@pytest.mark.parametrize("page", sorted(p.name for p in DOCS.glob("*.md")))
+def test_blocks_of_a_page_run(page, capsys):
+    """Top to bottom in one namespace; the asserts in them are the test."""
+    names: dict = {}
+    for k, block in enumerate(re.findall(r"^```python\n(.*?)^```", (DOCS / page).read_text(), re.M | re.S)):
+        exec(compile(block, f"{page}[{k}]", "exec"), names)
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_examples_in_docstrings(name):
+    module = importlib.import_module(f"jsmitsm.{name}")
+    result = doctest.testmod(module, optionflags=doctest.NORMALIZE_WHITESPACE)
+    assert result.failed == 0
+
+
+def public():
+    """What ``import jsmitsm`` offers, by name, that is the package's own."""
+    names = {n for n in dir(jsmitsm) if not n.startswith("_")} | set(jsmitsm._LAZY_NAMES)
+    things = {name: getattr(jsmitsm, name) for name in sorted(names)}
+    return {
+        name: thing
+        for name, thing in things.items()
+        if callable(thing) and getattr(thing, "__module__", "").startswith("jsmitsm")
+    }
+
+
+def test_every_public_name_is_documented_and_in_the_reference():
+    listed = set(re.findall(r"^::: ([\w.]+)$", (DOCS / "reference.md").read_text(), re.M))
+    for name, thing in public().items():
+        assert thing.__doc__, f"{name} has no docstring"
+        assert listed & {thing.__module__, f"{thing.__module__}.{name}"}, f"{name} is not in docs/reference.md"
+
+
+def test_the_site_is_complete():
+    """Every page stands in the navigation, and every object of the reference exists."""
+    config = (DOCS.parent / "mkdocs.yml").read_text()
+    assert set(re.findall(r": (\w+\.md)$", config, re.M)) == {p.name for p in DOCS.glob("*.md")}
+    for target in re.findall(r"^::: ([\w.]+)$", (DOCS / "reference.md").read_text(), re.M):
+        module, _, name = target.rpartition(".")
+        try:
+            importlib.import_module(target)
+        except ModuleNotFoundError:
+            assert hasattr(importlib.import_module(module), name), target

@@ -1,0 +1,209 @@
+"""Clouds from meshes, polygons and tables, solutions to them; each against a geometry known by hand."""
+
+import builtins
+
+import numpy as np
+import pytest
+
+import jsmitsm as js
+from jsmitsm.files import from_csv, from_mesh, from_shapely, to_csv, to_mesh, to_pandas, to_xarray
+from jsmitsm.shapes import from_polygon
+from jsmitsm.simplices import simplices
+
+meshio = pytest.importorskip("meshio")
+
+
+def lattice(kind):
+    """Nodes of the unit square or cube, three to a side, and their cells of one kind."""
+    dim = 2 if kind in ("triangle", "quad", "triangle6", "quad9") else 3
+    axes = [np.linspace(0.0, 1.0, 3)] * dim
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, dim)
+    number = np.arange(3**dim).reshape((3,) * dim)
+    if kind == "triangle6":  # two triangles of second order, the middles of their sides lattice nodes
+        cells = [number[[0, 2, 2, 1, 2, 1], [0, 0, 2, 0, 1, 1]], number[[0, 2, 0, 1, 1, 0], [0, 2, 2, 1, 2, 1]]]
+    elif kind == "quad9":
+        cells = [number[[0, 2, 2, 0, 1, 2, 1, 0, 1], [0, 0, 2, 2, 0, 1, 2, 1, 1]]]
+    else:
+        cells = []
+        for corner in np.ndindex((2,) * dim):
+            part = number[tuple(slice(c, c + 2) for c in corner)]
+            if dim == 2:
+                (a, d), (b, c) = part
+                cells += [[a, b, c, d]] if kind == "quad" else [[a, b, c], [a, c, d]]
+                continue
+            (a, e), (d, h) = part[0]
+            (b, f), (c, g) = part[1]
+            if kind == "hexahedron":
+                cells += [[a, b, c, d, e, f, g, h]]
+            elif kind == "wedge":
+                cells += [[a, b, c, e, f, g], [a, c, d, e, g, h]]
+            else:  # six tetrahedra round the diagonal from a to g
+                ring = [b, c, d, h, e, f]
+                cells += [[a, ring[k], ring[(k + 1) % 6], g] for k in range(6)]
+    return meshio.Mesh(np.pad(points, ((0, 0), (0, 3 - dim))), [(kind, np.array(cells))]), points
+
+
+@pytest.mark.parametrize("kind", ["triangle", "quad", "triangle6", "quad9", "tetra", "hexahedron", "wedge"])
+def test_boundary_and_normals_of_every_kind_of_cell(kind):
+    """Of 3^D nodes all but the middle one are boundary; its normal is the sum of the faces' it lies on."""
+    mesh, points = lattice(kind)
+    cloud = from_mesh(mesh)
+    assert (cloud.points == points).all()
+    assert sorted(cloud.groups) == ["boundary", "interior"]
+    assert cloud.groups["interior"].tolist() == [len(points) // 2]
+    expected = np.where(points == 0, -1.0, np.where(points == 1, 1.0, 0.0))[cloud.boundary]
+    expected /= np.linalg.norm(expected, axis=1, keepdims=True)
+    # Angle weights make corners exact bisectors; a node amid a face between triangles is exact to rounding.
+    np.testing.assert_allclose(cloud.normals[cloud.boundary], expected, atol=1e-14)
+
+
+def test_a_pyramid_has_its_five_faces():
+    points = [[0, 0, 0], [2, 0, 0], [2, 2, 0], [0, 2, 0], [1, 1, 1.0]]
+    cloud = from_mesh(meshio.Mesh(points, [("pyramid", [[0, 1, 2, 3, 4]])]))
+    np.testing.assert_allclose(cloud.normals[4], [0, 0, 1], atol=1e-14)
+    assert cloud.normals[0] @ [1, 1, 1] < 0 and len(cloud.groups["boundary"]) == 5
+
+
+def test_gmsh_file_with_physical_names(tmp_path):
+    """A Gmsh file: an orphan node, named sides, a tag within the domain that is no boundary."""
+    points = [[9, 9, 0], *([x, y, 0] for y in range(3) for x in range(3))]
+    quads = [[1, 2, 5, 4], [2, 3, 6, 5], [4, 5, 8, 7], [5, 6, 9, 8]]
+    lines = [[1, 2], [2, 3], [3, 6], [6, 9], [4, 5]]
+    mesh = meshio.Mesh(
+        points,
+        [("quad", quads), ("line", lines)],
+        cell_data={"gmsh:physical": [[5] * 4, [2, 2, 8, 8, 3]], "gmsh:geometrical": [[1] * 4, [1, 1, 2, 2, 3]]},
+        field_data={k: np.array(v) for k, v in
+                    {"right": [8, 1], "bottom": [2, 1], "inner": [3, 1], "all": [5, 2]}.items()},
+    )  # fmt: skip
+    mesh.write(tmp_path / "square.msh", file_format="gmsh22", binary=False)
+    cloud = from_mesh(tmp_path / "square.msh")
+    assert len(cloud) == 9 and cloud.points.max() == 2.0
+    # The file lists names by number: "bottom" takes the corner; "inner" keeps the end that lies on the boundary.
+    assert {k: cloud.points[v].tolist() for k, v in cloud.groups.items()} == {
+        "interior": [[1, 1]],
+        "right": [[2, 1], [2, 2]],
+        "bottom": [[0, 0], [1, 0], [2, 0]],
+        "inner": [[0, 1]],
+        "boundary": [[0, 2], [1, 2]],
+    }
+    np.testing.assert_allclose(cloud.normals[cloud.groups["bottom"]][1], [0, -1])
+    # In memory "right" is named first.
+    assert from_mesh(mesh).points[from_mesh(mesh).groups["right"]].tolist() == [[2, 0], [2, 1], [2, 2]]
+
+
+def test_cell_sets_point_sets_and_a_chosen_tag():
+    mesh, _ = lattice("triangle")
+    side = [[0, 1], [1, 2]]
+    cells = [*mesh.cells, ("line", side)]
+    named = meshio.Mesh(mesh.points, cells, cell_sets={"west": [np.array([], int), np.array([0, 1])]})
+    assert from_mesh(named).groups["west"].tolist() == [0, 1, 2]
+    points = meshio.Mesh(mesh.points, mesh.cells, point_sets={"east": np.array([6, 7, 8])})
+    assert from_mesh(points).groups["east"].tolist() == [6, 7, 8]
+    tagged = meshio.Mesh(mesh.points, cells, cell_data={"mark": [[0] * 8, [4, 4]]})
+    assert from_mesh(tagged, tags="mark").groups["4"].tolist() == [0, 1, 2]
+    with pytest.raises(ValueError, match="'colour' is none of the mesh's cell data"):
+        from_mesh(tagged, tags="colour")
+
+
+def test_a_problem_on_a_mesh_file_is_solved_and_written_back(tmp_path):
+    """u = x^2 + y is a polynomial: exact on the nodes of any mesh; VTU brings it back to the last bit."""
+    hole = [(0.8, 0.4), (1.2, 0.4), (1.2, 0.6), (0.8, 0.6)]
+    cloud = from_polygon([(0, 0), (2, 0), (2, 1), (0, 1)], 0.2, holes=[hole])
+    mesh = meshio.Mesh(np.pad(cloud.points, ((0, 0), (0, 1))), [("triangle", simplices(cloud))])
+    mesh.write(tmp_path / "plate.vtk")
+    cloud = from_mesh(tmp_path / "plate.vtk")
+    exact = cloud.points[:, 0] ** 2 + cloud.points[:, 1]
+    problem = js.Problem(lambda u, x: js.laplacian(u)(x) - 2.0, {"boundary": js.dirichlet(lambda x: x[0] ** 2 + x[1])})
+    sol = js.solve(problem, cloud, order=3)
+    np.testing.assert_allclose(sol.u, exact, atol=1e-11)  # round-off of some hundred unknowns
+    to_mesh(sol, twice=2 * exact).write(tmp_path / "u.vtu")
+    back = meshio.read(tmp_path / "u.vtu")
+    assert (back.point_data["u"] == sol.u).all() and (back.point_data["twice"] == 2 * exact).all()
+    # The hole stays open: 2 x 1 less 0.4 x 0.2.
+    corner = back.points[back.cells_dict["triangle"]]
+    area = np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1).sum() / 2
+    assert abs(area - 1.92) < 1e-12
+
+
+def test_bad_meshes_are_named():
+    flat = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]]
+    for mesh, text in (
+        (meshio.Mesh(flat, []), "has no cells"),
+        (meshio.Mesh(flat, [("triangle", [[0, 1, 2], [0, 1, 3]])]), "a surface in space is no domain"),
+        (meshio.Mesh(flat, [("polygon", [[0, 1, 2]])]), "'polygon' are not understood"),
+        (3, "expected a meshio.Mesh or the path"),
+    ):
+        with pytest.raises(ValueError, match=text):
+            from_mesh(mesh)
+
+
+def test_shapely_polygon_and_text():
+    shapely = pytest.importorskip("shapely")
+    ring = shapely.Point(0, 0).buffer(1.0).difference(shapely.box(-0.3, -0.3, 0.3, 0.3))
+    cloud = from_shapely(ring, 0.1)
+    assert sorted(cloud.groups) == ["boundary", "hole0", "interior"]
+    hole = cloud.points[cloud.groups["hole0"]]
+    np.testing.assert_allclose(np.abs(hole).max(axis=1), 0.3, atol=1e-12)
+    again = from_shapely(ring.wkt, 0.1)
+    assert len(again) == len(cloud)
+    with pytest.raises(ValueError, match="got MultiPolygon"):
+        from_shapely(shapely.MultiPolygon([shapely.box(0, 0, 1, 1), shapely.box(2, 2, 3, 3)]), 0.1)
+    with pytest.raises(ValueError, match="is empty"):
+        from_shapely(shapely.Polygon(), 0.1)
+
+
+@pytest.mark.parametrize("cloud", [js.interval(0, 1 / 3, 4), js.rectangle((0, 0), (1, 2), (4, 5), jitter=0.3)], ids=str)
+def test_csv_there_and_back(cloud, tmp_path):
+    to_csv(cloud, tmp_path / "cloud.csv")
+    back = from_csv(tmp_path / "cloud.csv")
+    assert (back.points == cloud.points).all()
+    assert dict(back.groups).keys() == dict(cloud.groups).keys()
+    assert all((back.groups[k] == cloud.groups[k]).all() for k in cloud.groups)
+    np.testing.assert_array_equal(back.normals, cloud.normals)
+
+
+def test_bad_csv_is_named(tmp_path):
+    path = tmp_path / "bad.csv"
+    for text, message in (
+        ("x,y\n0,1\n", r"columns \['x', 'y'\]; expected x \(and y, z\) and group"),
+        ("x,group\n0,left\none,interior\n", "line 3: x = 'one' is no number"),
+        ("x,group\n", "no rows"),
+        ("x,group\n0,left\n,interior\n", "NaN or infinite"),
+    ):
+        path.write_text(text)
+        with pytest.raises(ValueError, match=message):
+            from_csv(path)
+
+
+def test_tables():
+    problem = js.Problem(lambda u, x: js.laplacian(u)(x), {"left": js.dirichlet(0.0), "right": js.dirichlet(1.0)})
+    sol = js.solve(problem, js.interval(0.0, 1.0, 9), order=3)
+    pytest.importorskip("pandas")
+    frame = to_pandas(sol, error=sol.u - sol.cloud.points[:, 0])
+    assert list(frame) == ["x", "group", "nx", "u", "error"] and frame.error.abs().max() < 1e-13
+    assert frame.set_index("group").u["right"] == 1.0
+    pytest.importorskip("xarray")
+    data = to_xarray(sol, twice=2 * sol.u)
+    assert float(data.u.where(data.group == "right", drop=True)[0]) == 1.0
+    assert data.attrs == {"method": "S", "order": 3, "converged": 1} and data.twice.dims == ("particle",)
+
+
+def test_a_missing_library_is_named_with_its_extra(monkeypatch):
+    real = builtins.__import__
+    missing = ("meshio", "pandas", "xarray", "shapely")
+
+    def blocked(name, *rest):
+        if name in missing:
+            raise ImportError(name)
+        return real(name, *rest)
+
+    monkeypatch.setattr("importlib.import_module", blocked)
+    cloud = js.interval(0.0, 1.0, 3)
+    for call, extra in (
+        (lambda: from_mesh("a.msh"), "mesh"),
+        (lambda: from_shapely("POINT (0 0)", 0.1), "mesh"),
+        (lambda: to_pandas(cloud), "tables"),
+    ):
+        with pytest.raises(ImportError, match=rf'pip install "jsmitsm\[{extra}\]"'):
+            call()

@@ -1,0 +1,73 @@
+"""Solutions say what speaks against them; healthy ones say nothing."""
+
+import pickle
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jsmitsm as js
+
+SIDES = ("left", "right", "bottom", "top")
+smooth = lambda x: jnp.sin(2 * x[0]) * jnp.exp(x[1])
+
+
+def posed(operator, exact, **bcs):
+    held = {side: js.dirichlet(exact) for side in SIDES}
+    return js.Problem(lambda u, x: operator(u, x) - operator(exact, x), held | bcs)
+
+
+def laplace(u, x):
+    return js.laplacian(u)(x)
+
+
+def square(n=21):
+    return js.rectangle((0, 0), (1, 1), (n, n), jitter=0.3)
+
+
+@pytest.mark.parametrize("order", [2, 4, 6])
+def test_a_healthy_solution_has_none(order):
+    slope = js.condition(lambda u, x, n: n @ (js.grad(u)(x) - js.grad(smooth)(x)))
+    sol = js.solve(posed(laplace, smooth, right=slope), square(), order=order)
+    assert sol.flags == []
+    sol.error_estimate()
+    assert sol.flags == [] and "FLAG" not in sol.diagnose()
+
+
+def test_a_layer_thinner_than_the_spacing():
+    eps = 0.01
+    layer = lambda x: x[0] - jnp.expm1(x[0] / eps) / jnp.expm1(1 / eps)
+    steep = posed(lambda u, x: -eps * js.laplacian(u)(x) + js.grad(u)(x)[0], layer)
+    sol = js.solve(steep, square())
+    assert np.abs(sol.u - jax.vmap(layer)(sol.cloud.points)).max() > 0.3
+    assert any("layer" in flag for flag in sol.flags) and "FLAG" in sol.diagnose()
+
+
+def test_waves_too_short_for_the_cloud():
+    k = 60.0
+    wave = lambda x: jnp.sin(k * (0.6 * x[0] + 0.8 * x[1]))
+    sol = js.solve(posed(lambda u, x: js.laplacian(u)(x) + k**2 * u(x), wave), square())
+    assert any("particles a length" in flag for flag in sol.flags)
+
+
+def test_a_large_estimate_is_a_flag():
+    wave = lambda x: jnp.sin(22 * x[0]) * jnp.cos(17 * x[1])
+    sol = js.solve(posed(laplace, wave), square(11), order=2)
+    before = sol.flags
+    sol.error_estimate()
+    assert len(sol.flags) == len(before) + 1 and "estimated error" in sol.flags[-1]
+
+
+def test_flags_survive_pickling():
+    eps = 0.01
+    layer = lambda x: x[0] - jnp.expm1(x[0] / eps) / jnp.expm1(1 / eps)
+    sol = js.solve(posed(lambda u, x: -eps * js.laplacian(u)(x) + js.grad(u)(x)[0], layer), square())
+    assert pickle.loads(pickle.dumps(sol)).flags == sol.flags != []
+
+
+def test_a_factorisation_tells_too():
+    ready = js.factorize(posed(laplace, smooth), square())
+    assert ready.solve(posed(laplace, smooth)).flags == []
+    spike = posed(laplace, lambda x: jnp.exp(-4000 * jnp.sum((x - 0.5) ** 2)))
+    assert ready.solve(spike).flags

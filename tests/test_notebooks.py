@@ -1,0 +1,20 @@
+"""Every notebook runs from its first cell to its last; the numbers are asserted inside of it."""
+
+from pathlib import Path
+
+import pytest
+
+NOTEBOOKS = Path(__file__).parent.parent / "notebooks"
+nbformat = pytest.importorskip("nbformat")
+nbclient = pytest.importorskip("nbclient")
+pytest.importorskip("ipykernel")
+
+
+@pytest.mark.parametrize("name", sorted(path.name for path in NOTEBOOKS.glob("*.ipynb")))
+def test_notebook_runs(name):
+    notebook = nbformat.read(NOTEBOOKS / name, as_version=4)
+    code = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    assert any("assert" in cell.source for cell in code), f"{name} asserts no number"
+    assert any(cell.outputs for cell in code), f"{name} was committed without its outputs"
+    # The limit is far above the minute that a notebook may take on a quiet machine: a busy one is no fault of its.
+    nbclient.NotebookClient(notebook, timeout=600, resources={"metadata": {"path": str(NOTEBOOKS)}}).execute()

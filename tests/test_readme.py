@@ -1,0 +1,82 @@
+"""What the README shows runs, prints what it says, and its commands name what exists."""
+
+import contextlib
+import io
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+README = (ROOT / "README.md").read_text()
+
+
+def blocks(text, language="python"):
+    return re.findall(rf"^```{language}\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+
+
+@pytest.fixture(scope="module")
+def ran():
+    """Names left and text printed by the README's Python blocks, run top to bottom."""
+    matplotlib = pytest.importorskip("matplotlib")
+    matplotlib.use("Agg")
+    names: dict = {}
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed):
+        for k, block in enumerate(blocks(README)):
+            if "jax_compilation_cache_dir" not in block:  # would change the directory for all other tests
+                exec(compile(block, f"README.md[{k}]", "exec"), names)
+    yield names, printed.getvalue()
+    matplotlib.pyplot.close("all")
+
+
+def test_first_block_prints_what_the_readme_says(ran):
+    """v = x^5 / 20 + 2 x + 1 is of degree 5: method III of order 5 has it exactly at x = 1.25."""
+    _, printed = ran
+    value, slope = map(float, re.findall(r"[\d.]+", printed.splitlines()[0]))
+    assert abs(value - (1.25**5 / 20 + 2 * 1.25 + 1)) < 1e-8  # eight digits are printed
+    assert abs(slope - (1.25**4 / 4 + 2)) < 1e-8
+    assert f"`{printed.splitlines()[0]}`" in README
+
+
+def test_nonlinear_plate(ran):
+    names, _ = ran
+    sol = names["sol"]
+    assert bool(sol.converged) and abs(float(sol.u.max()) - 0.3225) < 2e-3  # its own order 6 says 0.3224
+
+
+def test_the_cache_block_names_real_options():
+    import jax
+
+    (block,) = [b for b in blocks(README) if "jax_compilation_cache_dir" in b]
+    for name in re.findall(r'update\("(\w+)"', block):
+        assert hasattr(jax.config, name)
+
+
+@pytest.mark.parametrize("mark, needed", [("paper", "-m benchmarks.paper"), ("tests", "-m pytest")])
+def test_the_two_commands_are_there(mark, needed):
+    """CI runs the second one as it stands; the first one's module exists."""
+    (command,) = re.findall(rf"<!-- {mark} -->\n```bash\n(.+)\n```", README)
+    assert command.startswith("python3 -m venv .venv && .venv/bin/pip install ") and command.endswith(needed)
+    for extra in re.findall(r"\[(\w+)\]", command):
+        assert f"\n{extra} = [" in (ROOT / "pyproject.toml").read_text()
+    if mark == "paper":
+        assert (ROOT / "benchmarks" / "paper.py").exists()
+
+
+def test_files_and_pictures_linked_exist():
+    for page in (ROOT / "README.md", *(ROOT / "docs").glob("*.md")):
+        for target in re.findall(r"\]\(([^)#:$\\]+\.\w+)(?:#[^)]*)?\)", page.read_text()):
+            assert (page.parent / target).exists(), f"{page.name} links to {target}"
+
+
+def test_tables_agree_with_the_data():
+    """Numbers in tables come from benchmarks/data and from nowhere else."""
+    from benchmarks.readme import PLACE, filled, tables
+
+    found = tables()
+    for page in (ROOT / "README.md", *(ROOT / "docs").glob("*.md")):
+        text = page.read_text()
+        assert filled(text, found) == text, f"run python -m benchmarks.readme: {page.name} differs from the data"
+        for _, name, body, _ in PLACE.findall(text):
+            assert not body.strip() or name in found, f"{page.name}: the table {name} has no data"
