@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jsmitsm as js
+from benchmarks.machine import describe
 from benchmarks.problems import PAPER, Case
 
 DATA = Path(__file__).parent / "data" / "tuning.json"
@@ -124,7 +125,7 @@ class Bench:
         near = self.stencils if h * d <= REACH else None
         try:
             sol = js.solve(case.problem(), self.cloud, method=self.method, order=self.order, kernel=kernel, stencils=near)
-        except js.SolveError:
+        except (js.SolveError, ValueError):  # singular, or too few neighbours
             return np.nan, np.nan
         return 100 * case.error(sol), float(sol.stats["lebesgue_max"])
 
@@ -160,3 +161,83 @@ def tuned(b: Bench, start: float, **options: Any) -> dict[str, Any]:
     if b.setup.other is not None:
         out["other"], out["other_paper"] = b.error(h, d, b.setup.other)[0], b.error(1.0, 4.0, b.setup.other)[0]
     return out
+
+
+def reference_error(b: Bench) -> float:
+    """True error in percent of the solution that "estimate" measures against."""
+    from importlib import import_module
+
+    scene = import_module("jsmitsm.tuning")._Scene(
+        b.setup.case.problem(), b.cloud, js.SuperGaussian(b.spacing, 4.0), "estimate",
+        {"method": b.method, "order": b.order},
+    )  # fmt: skip
+    exact = b.setup.case.values(b.cloud.points)
+    return float(100 * np.linalg.norm(scene.reference[:, 0] - exact) / np.linalg.norm(exact))
+
+
+def record(setup: Setup, method: str, quick: bool) -> dict[str, Any]:
+    """Everything about one method on one setup."""
+    b = bench(setup, method)
+    paper, bounded = b.error(1.0, 4.0)
+    points = grid(b, 3 if quick or setup.case.dim == 3 else 1)
+    bound = max(BOUND, bounded) if np.isfinite(bounded) else BOUND
+    admitted = [e for *_, e, lebesgue in points if np.isfinite(e) and lebesgue <= bound]
+    return {
+        "setup": setup.name, "smooth": setup.smooth, "method": method, "order": b.order, "particles": len(b.cloud),
+        "spacing": b.spacing, "lebesgue_bound": bound, "paper": paper, "untuned": b.error(0.8, 4.0)[0],
+        "grid_10th_percentile": float(np.quantile(admitted, 0.1)) if admitted else np.nan,
+        "grid_solves": len(points), "grid": points, "reference": reference_error(b),
+        "runs": {str(h): tuned(b, h, steps=15 if quick else 50) for h in STARTS},
+    }  # fmt: skip
+
+
+def misses(entry: dict[str, Any], run: dict[str, Any]) -> list[str]:
+    """Which of the bounds that a tuned kernel should keep it does not."""
+    error, paper = run["tuned"], entry["paper"]
+    if not entry["smooth"]:
+        return [] if error <= 1.05 * max(paper, entry["reference"]) else ["paper or reference"]
+    judged = {
+        "grid": error <= 1.2 * entry["grid_10th_percentile"],
+        "paper": not np.isfinite(paper) or error <= 0.8 * paper,
+        "start": not np.isfinite(run["start"]) or error <= run["start"] * (1 + 1e-9),
+        "1%": run["one_percent"] < 0.2,
+        "other": "other" not in run or not np.isfinite(run["other_paper"]) or run["other"] < run["other_paper"],
+    }
+    return [name for name, kept in judged.items() if not kept]
+
+
+HEAD = f"{'problem':<14}{'method':<8}{'from':>5}{'start':>10}{'tuned':>10}{'grid':>10}{'h=0.8':>10}{'paper':>10}"
+HEAD += f"{'reference':>11}{'solves':>8}{'(grid)':>8}  misses"
+
+
+def lines(entry: dict[str, Any]) -> list[str]:
+    """The table's lines of one method on one setup."""
+    out = []
+    for start, run in entry["runs"].items():
+        numbers = (run["start"], run["tuned"], entry["grid_10th_percentile"], entry["untuned"], entry["paper"])
+        out.append(
+            f"{entry['setup']:<14}{entry['method'] + ' ' + str(entry['order']):<8}{start:>5}"
+            + "".join(f"{x:>10.3g}" for x in numbers)
+            + f"{entry['reference']:>11.3g}{run['solves']:>8}{entry['grid_solves']:>8}  {', '.join(misses(entry, run))}"
+        )
+    return out
+
+
+def main(arguments: list[str]) -> None:
+    jax.config.update("jax_enable_x64", True)
+    quick = "--quick" in arguments
+    wanted = [a for a in arguments if not a.startswith("-")]
+    names = [n for n in SETUPS if not wanted or any(w in n for w in wanted)]
+    print("Relative L2 errors in percent; start, tuned, grid (10th percentile), h = 0.8, paper: h = 1 spacing, d = 4.\n")
+    print(HEAD)
+    entries = []
+    for name in names[:2] if quick and not wanted else names:
+        for method in METHODS:
+            entries.append(record(SETUPS[name], method, quick))
+            print("\n".join(lines(entries[-1])), flush=True)
+            if not quick and not wanted:
+                DATA.write_text(json.dumps({"machine": describe(), "results": entries}) + "\n")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

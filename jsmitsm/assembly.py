@@ -82,12 +82,17 @@ def _in_size_classes(function: Any) -> Any:
             cloud_wide(points), cloud_wide(kernel), class_wide(ids), class_wide(neighbours), given,
             class_wide(each), cloud_wide(whole),
         )  # fmt: skip
-        # An inner program has no options of its own.
-        made = (quick if size <= _FEW and not is_traced(arguments) else program)(scheme, *arguments)
+        made = (quick if size <= _FEW and not _inside(arguments) else program)(scheme, *arguments)
         # Cut on the host where nothing is traced: an eager slice would compile for every length.
         return jax.tree.map(lambda x: (x if isinstance(x, jax.core.Tracer) else np.asarray(x))[:m], made)
 
     return padded
+
+
+def _inside(arguments: Any) -> bool:
+    """Whether the call is part of a larger program: an inner one has no compiler options of its own."""
+    # Under jit every operation is recorded, one on constants too.
+    return is_traced(arguments, jnp.zeros(()))
 
 
 @_in_size_classes

@@ -13,7 +13,7 @@ from jsmitsm.boundary import Group, group_conditions, is_traced
 from jsmitsm.clouds import Cloud
 from jsmitsm.kernels import EDGE, Constant, Gaussian, Kernel
 from jsmitsm.moments import Scheme
-from jsmitsm.neighbours import Stencils, nearest, within
+from jsmitsm.neighbours import Stencils, in_line, nearest, within
 from jsmitsm.periodic import Images, periodic_images
 from jsmitsm.problem import Problem
 from jsmitsm.recursion import Recursion, free_indices, recursion
@@ -305,7 +305,7 @@ def find_stencils(
                 f"cloud: {len(points)} particles are too few for this order, which needs at least {needed + 1} "
                 "in every stencil; lower the order or add particles"
             )
-        return nearest(points, min(size, len(points)), which)
+        return (in_line if cloud.dim == 1 else nearest)(points, min(size, len(points)), which)
     return within(points, np.asarray(kernel.d) * np.asarray(kernel.h), which)
 
 

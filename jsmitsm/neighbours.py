@@ -102,6 +102,22 @@ def nearest(points: np.ndarray, size: int, which: np.ndarray | None = None) -> S
     return Stencils(_self_first(index, which), radius)
 
 
+def in_line(points: np.ndarray, size: int, which: np.ndarray | None = None) -> Stencils:
+    """In 1D: as many neighbours on either side, ``size`` in all with the particle itself.
+
+    The nearest ones would leave a cluster of particles without a link to the others.
+    """
+    n = len(points)
+    x = points[:, 0]
+    order = np.argsort(x, kind="stable")
+    rank = np.empty(n, int)
+    rank[order] = np.arange(n)
+    own = np.arange(n) if which is None else which
+    first = np.clip(rank[own] - size // 2, 0, n - size)
+    index = order[first[:, None] + np.arange(size)].astype(np.int32)
+    return Stencils(_self_first(index, which), np.abs(x[index] - x[own][:, None]).max(axis=1))
+
+
 def within(points: np.ndarray, radius: Any, which: np.ndarray | None = None) -> Stencils:
     """All particles within ``radius``, of all particles or of those in ``which``."""
     centres = points if which is None else points[which]

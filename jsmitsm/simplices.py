@@ -24,10 +24,7 @@ def simplices(cloud: Cloud) -> np.ndarray:
     (8, 3)
     """
     points = _scaled(cloud)
-    if cloud.dim == 1:
-        order = np.argsort(points[:, 0])
-        return np.stack([order[:-1], order[1:]], axis=1)
-    cells = _delaunay(points).simplices
+    cells = _intervals(points) if cloud.dim == 1 else _delaunay(points).simplices
     return cells[_solid(points, cells) & ~_outside(cloud, points, cells)]
 
 
@@ -41,8 +38,9 @@ def boundary_facets(cloud: Cloud) -> tuple[np.ndarray, np.ndarray]:
     """
     points = _scaled(cloud)
     if cloud.dim == 1:
-        ends = np.array([[points[:, 0].argmin()], [points[:, 0].argmax()]])
-        return ends, np.array([[-1.0], [1.0]])
+        cells = simplices(cloud)
+        left, right = np.setdiff1d(*cells.T), np.setdiff1d(*cells.T[::-1])
+        return np.concatenate([left, right])[:, None], np.repeat([-1.0, 1.0], [len(left), len(right)])[:, None]
     delaunay = _delaunay(points)
     cells = delaunay.simplices
     inside = ~_outside(cloud, points, cells)
@@ -58,6 +56,11 @@ def boundary_facets(cloud: Cloud) -> tuple[np.ndarray, np.ndarray]:
     ahead = at.mean(axis=1) + 1e-3 * np.linalg.norm(sides[:, 0], axis=1, keepdims=True) * normal
     into = delaunay.find_simplex(ahead)
     return facets, np.where(((into >= 0) & inside[into])[:, None], -normal, normal)
+
+
+def _intervals(points: np.ndarray) -> np.ndarray:
+    order = np.argsort(points[:, 0])
+    return np.stack([order[:-1], order[1:]], axis=1)
 
 
 def _scaled(cloud: Cloud) -> np.ndarray:

@@ -93,3 +93,18 @@ def test_a_large_estimate_is_a_flag():
     share = np.linalg.norm(sol.error_estimate()) / np.linalg.norm(sol.u)
     assert (share > 0.1) == any("estimated error" in f for f in sol.flags)
     assert share > 0.1
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_random_particles_on_a_line(seed):
+    """The five nearest neighbours of a cluster may all be inside of it: a stencil takes both sides."""
+    x = np.sort(np.random.default_rng(seed).random(38))
+    points = np.concatenate([[0.0], x, [1.0]])[:, None]
+    cloud = js.Cloud(points, {"left": [0], "interior": np.arange(1, 39), "right": [39]})
+    sol = js.solve(
+        js.Problem(lambda u, x: js.laplacian(u)(x) - 20 * x[0] ** 3, {"left": js.dirichlet(0), "right": js.dirichlet(1)}),
+        cloud,
+        order=5,
+    )
+    np.testing.assert_allclose(sol.u, points[:, 0] ** 5, atol=1e-11)
+    assert sol.stats["lebesgue_max"] < 1.5
