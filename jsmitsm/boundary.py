@@ -91,8 +91,10 @@ def group_conditions(problem: Problem, cloud: Cloud, order: int, highest: int) -
         raise ValueError(f"bcs: periodic names {unknown[0]!r}, which is no boundary group of the cloud; it has {names}")
     missing = [n for n in names if n not in given and n not in used and len(cloud.groups[n])]
     if missing:
+        stray = [n for n in given if n not in cloud.groups]
         raise ValueError(
-            f"bcs: no condition for the boundary group(s) {missing}; the cloud has {names}. "
+            f"bcs: no condition for the boundary group(s) {missing}; the cloud has {names}"
+            + (f", but not {stray}. " if stray else ". ") +
             "Give each a condition, js.free() where none belongs"
         )
     seconds = {c.groups[1] for cs in given.values() for c in cs if c.kind == "periodic"}

@@ -8,6 +8,8 @@ from typing import Any
 import jax
 import numpy as np
 
+from jsmitsm.errors import some
+
 INTERIOR = "interior"
 _SIDES = (("left", 0, 0), ("right", 0, 1), ("bottom", 1, 0), ("top", 1, 1), ("front", 2, 0), ("back", 2, 1))
 
@@ -157,7 +159,7 @@ def _checked_points(points: Any) -> Any:
     if isinstance(points, np.ndarray):
         bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
         if len(bad):
-            raise ValueError(f"points: NaN or infinite coordinates at particles {_some(bad)}; remove them")
+            raise ValueError(f"points: NaN or infinite coordinates at particles {some(bad, most=8)}; remove them")
         order = np.lexsort(points.T)
         same = np.flatnonzero((np.diff(points[order], axis=0) == 0).all(axis=1))
         if len(same):
@@ -200,14 +202,16 @@ def _checked_groups(groups: Mapping[str, Any], n: int) -> Groups:
         taken = once[(owner[once] >= 0) | (count > 1)]
         if len(taken):
             raise ValueError(
-                f"groups[{name!r}]: particles {_some(taken)} are in two groups or twice "
+                f"groups[{name!r}]: particles {some(taken, most=8)} are in two groups or twice "
                 "in one; every particle belongs to exactly one group"
             )
         owner[index] = k
         checked[name] = index
     missing = np.flatnonzero(owner < 0)
     if len(missing):
-        raise ValueError(f"groups: particles {_some(missing)} belong to no group; add them to one, e.g. 'interior'")
+        raise ValueError(
+            f"groups: particles {some(missing, most=8)} belong to no group; add them to one, e.g. 'interior'"
+        )
     return Groups(checked)
 
 
@@ -231,16 +235,10 @@ def _checked_normals(normals: Any, points: Any, groups: Groups) -> Any:
     bad = np.flatnonzero(np.abs(length - 1) > 1e-6)
     if len(bad):
         raise ValueError(
-            f"normals: not of unit length at particles {_some(bad)} (length {length[bad[0]]:.3g}); "
+            f"normals: not of unit length at particles {some(bad, most=8)} (length {length[bad[0]]:.3g}); "
             "divide by np.linalg.norm(normals, axis=1, keepdims=True)"
         )
     return normals
-
-
-def _some(index: np.ndarray, most: int = 8) -> str:
-    """A short list of particle numbers for a message."""
-    listed = ", ".join(str(int(i)) for i in index[:most])
-    return f"[{listed}{', ...' if len(index) > most else ''}]"
 
 
 def _describe_groups(groups: Any) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 
 class SolveError(RuntimeError):
@@ -19,3 +20,12 @@ class SolveError(RuntimeError):
     def __init__(self, message: str, particles: Sequence[int] = ()) -> None:
         super().__init__(message)
         self.particles: tuple[int, ...] = tuple(int(i) for i in particles)
+
+
+def some(index: Any, most: int = 6) -> str:
+    """A short list of particle numbers (n,) for a message.
+
+    >>> some([3, 1, 4], most=2)
+    '[3, 1, ...]'
+    """
+    return f"[{', '.join(str(int(i)) for i in index[:most])}{', ...' if len(index) > most else ''}]"

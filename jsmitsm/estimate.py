@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from typing import Any
 
 import jax
@@ -149,12 +150,10 @@ class Factorization:
     def _finish(self, problem: Problem, nums: Numbers | None) -> Solution:
         nums = self._nums if nums is None else nums
         disc = self._disc
-        run = self._run
+        run = copy(self._run)  # the solution's own: what it says of itself must not change with the next
         x, good = run.solved(*self._matrix, dz.right_side(disc, nums, self._classes, self._rows))
         values = dz.with_held(disc, nums, x)
         run.rows, run.nums, run.values = (self._classes, self._rows), nums, np.asarray(values)
-        for name in ("factor", "misfit"):
-            run.__dict__.pop(name, None)
         recipe = Recipe(disc.scheme.method, disc.rec.order, None, "loo", problem.fields)
         fit = Fit(problem, disc.cloud, disc.kernel, dz.table(disc), None, recipe)
         return Solution(values, disc.cloud, recipe, fit, good, 1, run.stats(), report=run.flags)

@@ -14,6 +14,7 @@ import numpy as np
 
 from jsmitsm import discretize as dz
 from jsmitsm import linsolve
+from jsmitsm.errors import some
 from jsmitsm.health import LEBESGUE
 
 # A particle may differ from the linear function through its neighbours by this part of the
@@ -62,7 +63,7 @@ def _roughness(run: Any, values: np.ndarray, nums: Any, out: list[str], found: d
     if len(bad):
         out.append(
             f"The values change by up to {rough.max():.0%} of their range between neighbours, at {len(bad)} "
-            f"particle(s), first {_some(bad)}: a layer, a jump or a wave finer than the cloud; refine it there."
+            f"particle(s), first {some(bad)}: a layer, a jump or a wave finer than the cloud; refine it there."
         )
 
 
@@ -151,7 +152,7 @@ def _weakness(run: Any, values: np.ndarray, nums: Any, out: list[str], found: di
     found["hopeless"] = len(bad) / len(ids)
     if len(bad) > FEW * len(ids):
         out.append(
-            f"{len(bad)} particle(s), first {_some(bad)}, amplify their neighbours' errors up to {size.max():.1e} "
+            f"{len(bad)} particle(s), first {some(bad)}, amplify their neighbours' errors up to {size.max():.1e} "
             "times (Lebesgue constant, up to 1.5 is healthy): choose a support with more, or more evenly spread, "
             "particles, or leave kernel out."
         )
@@ -195,7 +196,3 @@ def _waves(run: Any, values: np.ndarray, nums: Any, out: list[str], found: dict[
             f"The operator has waves of {2 * np.pi / (k * spacing):.1f} particles a length, too few for order {order} "
             f"over {cells:.0f} particles: their phase is lost; refine, or raise the order."
         )
-
-
-def _some(index: Any, most: int = 6) -> str:
-    return f"[{', '.join(str(int(i)) for i in index[:most])}{', ...' if len(index) > most else ''}]"

@@ -165,13 +165,10 @@ def prefers_least_squares(disc: Discretization, nums: Numbers) -> bool:
     if (values[:, 0] * values[:, -1] < -1e-10 * diffusion**2).any():
         return True
     drift = [s for s, (_, b) in enumerate(rec.slots) if sum(b) == 1]
-    points = concrete(disc.cloud.points)
-    if not drift or points is None:
+    if not drift or concrete(disc.cloud.points) is None:
         return False
     speed = np.linalg.norm(jac[0, drift, 0], axis=0)
-    points = np.asarray(points)
-    apart = (np.prod(np.ptp(points, axis=0)) / len(points)) ** (1.0 / rec.dim)
-    return bool(np.median(speed * apart / diffusion) > 2.0)
+    return bool(np.median(speed * mean_spacing(disc) / diffusion) > 2.0)
 
 
 def _timelike(rec: Recursion) -> bool:
@@ -196,7 +193,7 @@ def cell_peclet(disc: Discretization, nums: Numbers) -> float:
 
 def mean_spacing(disc: Discretization) -> float:
     """The edge of the cube that each particle has for itself."""
-    points = np.asarray(disc.cloud.points)
+    points = np.asarray(concrete(disc.cloud.points))
     return float((np.prod(np.ptp(points, axis=0)) / len(points)) ** (1.0 / disc.rec.dim))
 
 

@@ -13,7 +13,7 @@ from jsmitsm import discretize as dz
 from jsmitsm import health, linsolve
 from jsmitsm.boundary import is_traced
 from jsmitsm.discretize import Class, Discretization, Numbers
-from jsmitsm.errors import SolveError
+from jsmitsm.errors import SolveError, some
 from jsmitsm.flags import flags
 from jsmitsm.moments import Row
 from jsmitsm.problem import Problem
@@ -58,7 +58,7 @@ class Run:
         bad = self.health.undetermined
         if len(bad):
             self.fail(
-                f"the moment systems of {len(bad)} particle(s) do not determine the solution, first {_some(bad)}: too "
+                f"the moment systems of {len(bad)} particle(s) do not determine the solution, first {some(bad)}: too "
                 "few neighbours, or neighbours in a special position; widen the support (h, d or stencils), lower "
                 "the order, or move the particles",
                 bad,
@@ -69,12 +69,12 @@ class Run:
         found = self.health
         if found is not None and len(found.repaired):
             self.messages.append(
-                f"{len(found.repaired)} weak stencil(s) were widened or balanced, first {_some(found.repaired)}."
+                f"{len(found.repaired)} weak stencil(s) were widened or balanced, first {some(found.repaired)}."
             )
         if found is not None and len(found.weak):
             self.messages.append(
                 f"{len(found.weak)} particle(s) stay weak (Lebesgue constant above {health.LEBESGUE}, at most "
-                f"{found.largest:.3g}), first {_some(found.weak)}: the cloud is too coarse or one-sided there."
+                f"{found.largest:.3g}), first {some(found.weak)}: the cloud is too coarse or one-sided there."
             )
 
     def fail(self, message: str, particles: Any = ()) -> None:
@@ -131,7 +131,7 @@ class Run:
             at = np.array([u for u in error.unknowns if u < n], int)
             particles = free[at] // fields
             self.fail(
-                f"{error.args[0].rstrip('.')}: particles {_some(particles)}; is a condition missing, a part of the "
+                f"{error.args[0].rstrip('.')}: particles {some(particles)}; is a condition missing, a part of the "
                 "cloud not connected, or the operator at a resonance?",
                 particles,
             )
@@ -246,8 +246,3 @@ def skipped(disc: Discretization) -> list[str]:
         out.append(f"{int(disc.held.all(axis=1).sum())} particles with held values")
     out += ["Taylor coefficients until asked for", "error estimate until asked for"]
     return out
-
-
-def _some(index: Any, most: int = 6) -> str:
-    index = np.asarray(index)
-    return f"[{', '.join(str(int(i)) for i in index[:most])}{', ...' if len(index) > most else ''}]"
