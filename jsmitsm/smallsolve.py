@@ -97,31 +97,74 @@ def gram_inverse(a: Any, tolerance: float | None = None) -> Any:
         return jnp.zeros((0, 0), a.dtype)
     size = jnp.sqrt(jnp.sum(a**2, axis=0))
     scale = 1.0 / jnp.where(size > 0, size, 1.0)
-    gram = (a * scale).T @ (a * scale)
+    a = a * scale
+    gram = a.T @ a
+    inverse = _inverse(gram) if tolerance is None else _pivoted_inverse(gram, tolerance)
+    return inverse * scale[:, None] * scale[None, :]
+
+
+@jax.custom_jvp
+def _inverse(gram: Any) -> Any:
+    """The inverse of a symmetric positive definite matrix (k, k)."""
+    return _inverse_of_one(gram)
+
+
+@_inverse.defjvp
+def _inverse_jvp(primals, tangents):
+    inverse = _inverse(primals[0])
+    return inverse, -inverse @ (tangents[0] @ inverse)
+
+
+@jax.custom_batching.custom_vmap
+def _inverse_of_one(gram: Any) -> Any:
+    return _sweeps(gram[..., None])[..., 0]
+
+
+@_inverse_of_one.def_vmap
+def _inverse_of_many(size: int, batched: Any, gram: Any) -> tuple[Any, bool]:
+    # The matrices side by side in the last axis: every sweep is then a loop over neighbouring numbers.
+    return jnp.moveaxis(_sweeps(jnp.moveaxis(gram, 0, -1)), -1, 0), True
+
+
+def _sweeps(g: Any) -> Any:
+    """The inverses of matrices (k, k, batch) by symmetric sweeps, one rank-one update each.
+
+    With v = g[j] - e_j a sweep is g - v v^T / g[j, j], but for 2 on the diagonal, which is taken off at the end.
+    """
+    k = g.shape[0]
+
+    def factors(g, j):
+        row = jax.lax.dynamic_index_in_dim(g, j, 0, keepdims=False)
+        pivot = jax.lax.dynamic_index_in_dim(row, j, 0, keepdims=False)
+        v = row - (jnp.arange(k) == j)[:, None]
+        return v, v / pivot
+
+    def sweep(j, carry):
+        g, v, u = carry
+        # The barrier keeps the update in place: without it the compiler joins it with the next row and copies g.
+        g = jax.lax.optimization_barrier(g - v[:, None] * u[None])
+        return g, *factors(g, jnp.minimum(j + 1, k - 1))
+
+    g, *_ = jax.lax.fori_loop(0, k, sweep, (g, *factors(g, 0)))
+    return 2.0 * jnp.eye(k, dtype=g.dtype)[:, :, None] - g
+
+
+def _pivoted_inverse(gram: Any, tolerance: float) -> Any:
+    """The same by one's own choice of pivots, without the columns that have none above the tolerance."""
     k = gram.shape[0]
 
-    def sweep(g, j, keep):
-        # With v = g[j] - e_j one rank-one update does the whole sweep but for 2 on the diagonal.
+    def step(_, carry):
+        g, done = carry
+        rest = jnp.where(done, -1.0, jnp.diagonal(g))
+        j = jnp.argmax(rest)
+        keep = rest[j] > tolerance
         at = jnp.arange(k) == j
-        row = g[j]
-        pivot = jnp.where(keep, row[j], 1.0)
-        v = row - at
-        return jnp.where(keep, g - jnp.outer(v, v / pivot) - 2.0 * jnp.outer(at, at), g)
+        v = g[j] - at
+        swept = g - jnp.outer(v, v / jnp.where(keep, rest[j], 1.0)) - 2.0 * jnp.outer(at, at)
+        return jnp.where(keep, swept, g), done.at[j].set(done[j] | keep)
 
-    if tolerance is None:
-        inverse = -jax.lax.fori_loop(0, k, lambda j, g: sweep(g, j, True), gram)
-    else:
-
-        def pivoted(_, carry):
-            g, done = carry
-            rest = jnp.where(done, -1.0, jnp.diagonal(g))
-            j = jnp.argmax(rest)
-            keep = rest[j] > tolerance
-            return sweep(g, j, keep), done.at[j].set(done[j] | keep)
-
-        g, done = jax.lax.fori_loop(0, k, pivoted, (gram, jnp.zeros(k, bool)))
-        inverse = jnp.where(done[:, None] & done[None, :], -g, 0.0)
-    return inverse * scale[:, None] * scale[None, :]
+    g, done = jax.lax.fori_loop(0, k, step, (gram, jnp.zeros(k, bool)))
+    return jnp.where(done[:, None] & done[None, :], -g, 0.0)
 
 
 def min_norm(a: Any, t: Any, tolerance: float | None = None) -> Any:
