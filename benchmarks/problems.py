@@ -1,8 +1,8 @@
-"""One named table of test problems with exact solutions, shared by tests, benchmarks and notebooks.
+"""Named test problems on boxes with exact solutions, shared by tests, benchmarks and notebooks.
 
 ``PAPER`` holds the three problems of Karamanli (2015), ``NONSMOOTH`` sources with a kink, a jump
 or a narrow peak, ``EXAMPLES`` what the notebooks solve, ``GENERIC`` everything else; ``ALL`` is their union. A problem added to
-``GENERIC`` reaches every user of the table.
+``GENERIC`` reaches every user of the table. Cases with clouds and ceilings of their own stand in ``equations``.
 """
 
 from __future__ import annotations
