@@ -23,7 +23,7 @@ from jsmitsm.boundary import is_traced
 
 # Seconds before a bar appears: what is done by then needs none.
 DELAY = 1.5
-# Particles between two movements of the bar; a multiple of the size classes of `assembly`.
+# At most so many particles between two movements of the bar.
 PIECE = 8192
 
 # Also set while a bar is shown, so that a solve inside a search opens no second one.
@@ -98,9 +98,10 @@ def in_pieces(what: str, one: Callable[[Any], Any], cls: Any, *context: Any) -> 
     if n <= 2 * PIECE or not watched() or is_traced(context, cls.neighbours, jnp.zeros(())):
         return one(cls)
     made = []
+    step = -(-n // -(-n // PIECE))  # pieces of one size: one program serves all
     with bar(what, n) as shown:
-        for start in range(0, n, PIECE):
-            some = slice(start, start + PIECE)
+        for start in range(0, n, step):
+            some = slice(start, start + step)
             made.append(one(replace(cls, ids=cls.ids[some], neighbours=cls.neighbours[some])))
             shown.update(len(cls.ids[some]))
     return jax.tree.map(lambda *x: np.concatenate(x), *made)
