@@ -1,4 +1,4 @@
-"""One named table of equations with known solutions, from transport to elasticity, with error ceilings.
+"""Equations with known solutions on clouds of their own, from transport to elasticity, with error ceilings.
 
 ``python -m benchmarks.equations [names] [--no-estimate]`` solves them with the default kernel and
 stencils, prints a table and writes ``benchmarks/data/equations.json``; ``--list`` names them.

@@ -1,8 +1,8 @@
-"""One named table of test problems with exact solutions, shared by tests, benchmarks and notebooks.
+"""Named test problems on boxes with exact solutions, shared by tests, benchmarks and notebooks.
 
 ``PAPER`` holds the three problems of Karamanli (2015), ``NONSMOOTH`` sources with a kink, a jump
-or a narrow peak, ``GENERIC`` everything else; ``ALL`` is their union. A problem added to
-``GENERIC`` reaches every user of the table.
+or a narrow peak, ``EXAMPLES`` what the notebooks solve, ``GENERIC`` everything else; ``ALL`` is their union. A problem added to
+``GENERIC`` reaches every user of the table. Cases with clouds and ceilings of their own stand in ``equations``.
 """
 
 from __future__ import annotations
@@ -271,4 +271,66 @@ GENERIC = {
     )
 }
 
-ALL = {**PAPER, **NONSMOOTH, **GENERIC}
+# ------------------------------------------------------------------ the examples of the notebooks
+
+
+def _skew_wave(x: Any) -> Any:
+    return jnp.sin(2 * x[0] + x[1])
+
+
+def _growing(x: Any) -> Any:
+    return jnp.exp(x[0]) * jnp.sin(x[1])
+
+
+def _steep(x: Any) -> Any:
+    return jnp.exp(x[0]) * jnp.sin(3 * x[1])
+
+
+def _film(u: Any, x: Any) -> Any:
+    return js.divergence(lambda y: js.grad(u)(y) / jnp.sqrt(1 + js.grad(u)(y) @ js.grad(u)(y)))(x)
+
+
+def _load(x: Any) -> Any:
+    return jnp.cos(jnp.pi * x[0] / 2) * jnp.cos(jnp.pi * x[1] / 2)
+
+
+def _conducting(u: Any, x: Any) -> Any:
+    return js.divergence(lambda y: jnp.exp(y[0] * y[1]) * js.grad(u)(y))(x)
+
+
+def layer(eps: float) -> Case:
+    """A wind from left to right with little diffusion: a layer of thickness eps at x = 1."""
+    return Case(
+        f"layer {eps:g}", "-eps laplacian(u) + u_x = 1", (0.0, 0.0), (1.0, 1.0),
+        lambda u, x: -eps * js.laplacian(u)(x) + js.grad(u)(x)[0] - 1.0,
+        lambda x: x[0] - jnp.expm1(x[0] / eps) / jnp.expm1(1 / eps),
+    )  # fmt: skip
+
+
+_WIDE = ((-1.0, -1.0), (1.0, 1.0))
+_RESTING = [js.dirichlet(0.0), js.condition(lambda u, x, n: js.laplacian(u)(x))]
+
+EXAMPLES = {
+    case.name: case
+    for case in (
+        Case("harmonic", "laplacian(u) = 0, u = exp(x) sin y", *_UNIT[2], _laplace, _growing),
+        Case("steep", "laplacian(u) = f, u = exp(x) sin 3y", *_UNIT[2], poisson(lambda x: -8 * _steep(x)), _steep),
+        manufactured("conductor", "div(exp(x y) grad u) = f, u = sin(2x + y)", *_WIDE, _conducting, _skew_wave),
+        Case(
+            "soap film", "no mean curvature, u = log(cos y / cos x) (Scherk)", *_WIDE, _film,
+            lambda x: jnp.log(jnp.cos(x[1]) / jnp.cos(x[0])),
+        ),
+        Case(
+            "resting plate", "laplacian^2(w) = q = cos(pi x/2) cos(pi y/2), w = 4 q / pi^4", *_WIDE,
+            lambda u, x: js.laplacian(js.laplacian(u))(x) - _load(x), lambda x: 4 * _load(x) / jnp.pi**4,
+            {side: _RESTING for side in SIDES[:4]},
+        ),
+        Case(
+            "oscillating rod", "u'' = -16 sin 4x, u = sin 4x + x", (0.0,), (2.0,),
+            poisson(lambda x: -16 * jnp.sin(4 * x[0])), lambda x: jnp.sin(4 * x[0]) + x[0],
+        ),
+        layer(0.05),
+    )
+}  # fmt: skip
+
+ALL = {**PAPER, **NONSMOOTH, **GENERIC, **EXAMPLES}

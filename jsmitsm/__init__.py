@@ -12,6 +12,7 @@ from jsmitsm.kernels import Constant, CubicSpline, Gaussian, Kernel, SuperGaussi
 from jsmitsm.neighbours import Stencils, stencils
 from jsmitsm.operators import divergence, grad, hessian, laplacian, partial
 from jsmitsm.problem import Condition, Problem, condition, dirichlet, fix, free, neumann, periodic, robin
+from jsmitsm.progress import no_progress
 from jsmitsm.shapes import from_polygon, from_sdf
 from jsmitsm.solution import Solution
 from jsmitsm.solve import solve

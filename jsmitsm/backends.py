@@ -16,6 +16,8 @@ from typing import Any
 
 import numpy as np
 
+from jsmitsm.progress import bar
+
 ITERATIVE = ("amg", "ilu")
 
 
@@ -94,14 +96,15 @@ class Krylov:
         x = np.zeros_like(b)
         for k in range(b.shape[1]):
             column = np.ascontiguousarray(b[:, k])
-            x[:, k], steps, gain = _bicgstab(matrix, column, guess, tolerance, self.most)
+            with bar("iterative solve") as shown:
+                x[:, k], steps, gain = _bicgstab(matrix, column, guess, tolerance, self.most, shown)
             self.iterations += steps
             self.stalled |= gain > 1e-6
         return x
 
 
 def _bicgstab(
-    a: Any, b: np.ndarray, guess: Callable[[np.ndarray], np.ndarray], tolerance: float, most: int
+    a: Any, b: np.ndarray, guess: Callable[[np.ndarray], np.ndarray], tolerance: float, most: int, shown: Any
 ) -> tuple[np.ndarray, int, float]:
     """Best iterate of preconditioned BiCGSTAB, steps taken, and its residual relative to b.
 
@@ -140,6 +143,7 @@ def _bicgstab(
         x = x + alpha * p_hat + omega * s_hat
         r = s - omega * t
         step += 1
+        shown.update()
         size = dot(r, r)
         if not np.isfinite(size):
             break

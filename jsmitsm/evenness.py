@@ -20,6 +20,9 @@ class Quality(NamedTuple):
     fill_distance: float
     separation_distance: float
 
+    def __repr__(self) -> str:
+        return f"Quality({', '.join(f'{name}={value:.3g}' for name, value in self._asdict().items())})"
+
 
 def quality(cloud: Cloud, spacing: Any = None) -> Quality:
     """How evenly the particles of a cloud lie, measured in local spacings so that graded clouds count alike.

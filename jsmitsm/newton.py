@@ -12,6 +12,7 @@ import numpy as np
 from jsmitsm import discretize as dz
 from jsmitsm.boundary import concrete, is_traced, sample
 from jsmitsm.errors import SolveError
+from jsmitsm.progress import bar
 from jsmitsm.system import Run
 from jsmitsm.taylor import multi_indices
 
@@ -34,7 +35,8 @@ def newton(run: Run, u0: Any) -> tuple[Any, Any, Any, Any]:
         values, taylor, good, steps = _compiled(run, values, taylor)
         rate = 0.1
     else:
-        values, taylor, good, steps, rate = _iterate(run, values, taylor, one)
+        with bar("Newton steps") as shown:
+            values, taylor, good, steps, rate = _iterate(run, values, taylor, one, shown)
     if is_traced(one):
         for _ in range(_repeats(rate)):
             values, taylor = _advance(run, taylor)
@@ -53,7 +55,9 @@ def _advance(run: Run, taylor: Any) -> tuple[Any, Any]:
     return values, dz.all_coefficients(run.disc, nums, values)
 
 
-def _iterate(run: Run, values: Any, taylor: Any, one: tuple[Any, Any]) -> tuple[Any, Any, bool, int, float]:
+def _iterate(
+    run: Run, values: Any, taylor: Any, one: tuple[Any, Any], shown: Any
+) -> tuple[Any, Any, bool, int, float]:
     """Damped Newton's method; the length of the next step must not grow (natural monotonicity)."""
     target = tuple(np.asarray(concrete(x)) for x in one)
     values = np.asarray(concrete(values))
@@ -75,6 +79,8 @@ def _iterate(run: Run, values: Any, taylor: Any, one: tuple[Any, Any]) -> tuple[
         rate = next_length / length if part == 1.0 else rate
         values, taylor, target, length = values_new, taylor_new, next_target, next_length
         steps += 1
+        shown.set_postfix_str(f"change {length:.1e}", refresh=False)
+        shown.update()
     relative = length / _size(target[0])
     good = bool(relative <= 1e-8)
     if not good:

@@ -21,6 +21,7 @@ class Condition:
         self.kind = kind
         self.field = field
         self.parts = parts
+        self.numbers = tuple(k for k, v in parts.items() if not callable(v) and not isinstance(v, (str, tuple)))
 
     def __getattr__(self, name: str) -> Any:
         try:
@@ -29,14 +30,15 @@ class Condition:
             raise AttributeError(name) from None
 
     def tree_flatten(self):
-        numbers = {k: v for k, v in self.parts.items() if not callable(v) and not isinstance(v, (str, tuple))}
-        static = tuple((k, v) for k, v in self.parts.items() if k not in numbers)
-        return tuple(numbers.values()), (self.kind, self.field, tuple(numbers), static)
+        static = tuple((k, v) for k, v in self.parts.items() if k not in self.numbers)
+        return tuple(self.parts[k] for k in self.numbers), (self.kind, self.field, self.numbers, static)
 
     @classmethod
     def tree_unflatten(cls, aux, leaves):
         kind, field, names, static = aux
-        return cls(kind, field, **dict(zip(names, leaves)), **dict(static))
+        new = cls(kind, field, **dict(zip(names, leaves)), **dict(static))
+        new.numbers = names  # leaves stay leaves, whatever a tool puts in their place
+        return new
 
     def __repr__(self) -> str:
         def short(v: Any) -> str:

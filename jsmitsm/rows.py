@@ -18,6 +18,7 @@ from jsmitsm.layout import Class, Discretization
 from jsmitsm.moments import Elimination, Row, Scheme
 from jsmitsm.neighbours import nearest, within
 from jsmitsm.numbers import Numbers
+from jsmitsm.progress import in_pieces
 from jsmitsm.repeats import repeats
 
 
@@ -145,8 +146,12 @@ def _recovery_kernel(disc: Discretization) -> tuple[Kernel, Any]:
 
 def class_rows(disc: Discretization, nums: Numbers, cls: Class, shared: Any) -> Row:
     """The rows of one class of particles."""
-    given = operands(disc, nums, cls.ids, cls.scheme, shared)
-    return assembly.rows(cls.scheme, disc.points, disc.kernel, cls.ids, cls.neighbours, given)
+
+    def one(cls: Class) -> Row:
+        given = operands(disc, nums, cls.ids, cls.scheme, shared)
+        return assembly.rows(cls.scheme, disc.points, disc.kernel, cls.ids, cls.neighbours, given)
+
+    return in_pieces("local fits", one, cls, disc.points, disc.kernel, vars(nums))
 
 
 def class_coefficients(disc: Discretization, nums: Numbers, cls: Class, shared: Any, u: Any) -> Any:

@@ -8,8 +8,8 @@ import numpy as np
 
 from jsmitsm.clouds import Cloud
 
-# A simplex whose longest edge exceeds this many usual edges of its corners bridges a gap; the second
-# number is for simplices with boundary particles only, the suspects.
+# A simplex whose longest edge exceeds this many usual edges of its corners bridges a gap; the first
+# number is for clouds without boundary, the second for simplices with boundary particles only, the suspects.
 _LONG = (3.0, 1.8)
 
 
@@ -17,7 +17,8 @@ def simplices(cloud: Cloud) -> np.ndarray:
     """Intervals, triangles or tetrahedra (M, D + 1) between the particles, those outside of the domain dropped.
 
     A simplex with boundary particles at all its corners lies outside where the normals point into it. Where normals
-    are missing, a simplex is dropped if its longest edge is much longer than the usual edges of its corners.
+    are missing, it is dropped if its longest edge is much longer than the usual edges of its corners.
+    Without normals the very corner of a notch may be filled, and what a particle on the very boundary sees across it.
 
     >>> import jsmitsm as js
     >>> simplices(js.rectangle((0, 0), (1, 1), (3, 3))).shape
@@ -93,17 +94,47 @@ def _outside(cloud: Cloud, points: np.ndarray, cells: np.ndarray) -> np.ndarray:
     """Mask of the simplices that cover a hole or a notch."""
     suspect = np.isin(cells, cloud.boundary).all(axis=1)  # an interior particle proves a simplex innocent
     if cloud.normals is None:
-        return _stretch(points, cells) > np.where(suspect, _LONG[1], _LONG[0])
+        # A cloud without any boundary shows its holes by long simplices only.
+        long = _stretch(points, cells)
+        if not len(cloud.boundary):
+            return long > _LONG[0]
+        return (long > _LONG[1]) & suspect | _bridges(points, cells, np.isin(cells, cloud.boundary))
     ahead = points[cells].mean(axis=1)[:, None] - points[cells]
     # Zero up to rounding where all corners lie on one straight side.
     return suspect & ((ahead * np.asarray(cloud.normals)[cells]).sum(axis=(1, 2)) > 1e-9)
+
+
+def _bridges(points: np.ndarray, cells: np.ndarray, rim: np.ndarray) -> np.ndarray:
+    """Mask of the simplices with one interior corner, close behind the boundary, that reach across a notch.
+
+    They have an edge between boundary particles that is much longer than those along the boundary.
+    """
+    n, (some, which) = len(points), _edges(cells)
+    inner = np.ones(n, bool)
+    inner[cells[rim]] = False
+    pairs = some[~inner[some].any(axis=1)]
+    length = np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1)
+    nearest = np.full(n, np.inf)
+    np.minimum.at(nearest, pairs, length[:, None])
+    ends = some[which]  # (M, edges, 2)
+    span = np.linalg.norm(points[ends[..., 0]] - points[ends[..., 1]], axis=2)
+    long = ~inner[ends].any(axis=2) & (span > _LONG[0] * nearest[ends].max(axis=2))
+    return (rim.sum(axis=1) == cells.shape[1] - 1) & long.any(axis=1)
+
+
+def _edges(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The different edges (E, 2) of simplices, and which of them each simplex has."""
+    corners = [(a, b) for a in range(cells.shape[1]) for b in range(a)]
+    every = np.sort(np.stack([cells[:, c] for c in corners], axis=1), axis=2)
+    edges, which = np.unique(every.reshape(-1, 2), axis=0, return_inverse=True)
+    return edges, which.reshape(every.shape[:2])
 
 
 def _stretch(points: np.ndarray, cells: np.ndarray) -> np.ndarray:
     """The longest edge of each simplex over the shortest of its corners' usual edges."""
     n = len(points)
     corners = [(a, b) for a in range(cells.shape[1]) for b in range(a)]
-    pairs = np.unique(np.concatenate([np.sort(cells[:, c], axis=1) for c in corners]), axis=0)
+    pairs, _ = _edges(cells)
     length = np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1)
     # Their median: few edges of a particle cross a hole, and on a stretched lattice at most half are short.
     owner, both = pairs.T.ravel(), np.tile(length, 2)

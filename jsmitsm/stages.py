@@ -10,6 +10,7 @@ import numpy as np
 from jsmitsm.clouds import Cloud
 from jsmitsm.errors import SolveError
 from jsmitsm.problem import Problem
+from jsmitsm.progress import bar
 from jsmitsm.solution import Solution
 from jsmitsm.solve import solve
 
@@ -58,9 +59,12 @@ def continuation(
             f"problem: expected a function of the parameter that returns a js.Problem, got {type(problem).__name__}"
         )
     options = {**options, "throw": True}
-    sols = [solve(problem(float(values[0])), cloud, u0=u0, **options)]
-    for before, after in zip(values[:-1], values[1:]):
-        sols.append(_onward(problem, cloud, float(before), float(after), sols[-1], options))
+    with bar("continuation", len(values)) as shown:
+        sols = [solve(problem(float(values[0])), cloud, u0=u0, **options)]
+        shown.update()
+        for before, after in zip(values[:-1], values[1:]):
+            sols.append(_onward(problem, cloud, float(before), float(after), sols[-1], options))
+            shown.update()
     return sols
 
 

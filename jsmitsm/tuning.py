@@ -8,7 +8,6 @@ only for the very numbers they were tuned to.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
@@ -26,6 +25,7 @@ from jsmitsm.kernels import EDGE, Kernel, SuperGaussian
 from jsmitsm.neighbours import Stencils, nearest
 from jsmitsm.newton import newton
 from jsmitsm.problem import Problem
+from jsmitsm.progress import bar
 from jsmitsm.solution import Recipe, Solution
 from jsmitsm.solve import Fit, _check, solve
 from jsmitsm.system import Run
@@ -139,14 +139,15 @@ def tune(
     _check_input(problem, cloud, kernel, objective, optimizer, steps, solve_options)
     options = {"method": "S", "order": 4, **solve_options}
     space = _Space(kernel, names, _checked_groups(groups, cloud, names))
-    scene = _Scene(problem, cloud, kernel, objective, options)
-    search = _Search(space, scene, optimizer, steps)
-    search.run(_bar(steps, progress))
-    best = search.best
-    assert best is not None
-    if not scene.linear:
-        options["u0"] = best.values
-    solution = solve(problem, cloud, kernel=best.kernel, **options)
+    with bar("tune", steps, progress) as shown:
+        scene = _Scene(problem, cloud, kernel, objective, options)
+        search = _Search(space, scene, optimizer, steps)
+        search.run(shown)
+        best = search.best
+        assert best is not None
+        if not scene.linear:
+            options["u0"] = best.values
+        solution = solve(problem, cloud, kernel=best.kernel, **options)
     return TuneResult(best.kernel, solution, search.history(), scene.messages, scene.solves + 1)
 
 
@@ -428,7 +429,7 @@ class _Search:
         free = scene.given is None
         self.highest = np.full(len(scene.cloud), np.inf) if free else np.asarray(scene.given.radius)
 
-    def run(self, bar: Any) -> None:
+    def run(self, shown: Any) -> None:
         scene, space = self.scene, self.space
         lowest, z, point = self._start()
         state, part, last = self.optimizer.init(z), 1.0, 0
@@ -441,7 +442,7 @@ class _Search:
                 scene.messages.append(f"Step {step}: nothing moves any more.")
                 break
             trial, reason = self._tried(new)
-            bar.update(1)
+            shown.update(1)
             if trial is None:
                 self.retreats.append((step, reason))
                 part, point, z = part / 2.0, self.best, self.best.z
@@ -453,10 +454,9 @@ class _Search:
             z, point, part = new, trial, min(1.0, 1.5 * part)
             if self._accept(point):
                 last = step
-            bar.set_postfix_str(f"objective {self.best.objective:.3g}")
+            shown.set_postfix_str(f"objective {self.best.objective:.3g}", refresh=False)
             if step - last >= PATIENCE:
                 break
-        bar.close()
         self._tell_retreats()
 
     def _tell_retreats(self) -> None:
@@ -594,27 +594,6 @@ def _concrete(kernel: Kernel) -> Kernel:
 def _largest(tree: Any) -> float:
     """The largest entry in size; NaN where any is."""
     return max((float(np.max(np.abs(x), initial=0.0)) for x in jax.tree.leaves(tree)), default=0.0)
-
-
-class _NoBar:
-    """Stands in where no bar is wanted."""
-
-    def update(self, n: int) -> None: ...
-
-    def set_postfix_str(self, text: str) -> None: ...
-
-    def close(self) -> None: ...
-
-
-def _bar(steps: int, progress: bool) -> Any:
-    """A progress bar, where tqdm is installed and someone is watching."""
-    if not progress or not sys.stderr.isatty():
-        return _NoBar()
-    try:
-        from tqdm import tqdm
-    except ImportError:
-        return _NoBar()
-    return tqdm(total=steps, desc="tune", leave=False)
 
 
 # ------------------------------------------------------------------ input

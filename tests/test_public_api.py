@@ -184,9 +184,29 @@ def test_a_problem_is_a_pytree_of_its_numbers():
     assert problem.replace(params={"s": 4.0}).params == {"s": 4.0} and problem.params == {"s": 3.0}
 
 
+@pytest.mark.parametrize("what", ["solution", "kernel", "problem", "cloud"])
+def test_checkpoint_tools_may_put_names_in_the_place_of_leaves(what, solution):
+    """What orbax does: a tree of names, one per leaf, with the structure of the tree itself."""
+    thing = {"solution": solution, "kernel": js.SuperGaussian(0.1, 3.0), "problem": PROBLEM.replace(
+        bcs={"left": js.dirichlet(1.0), "right": js.robin(1.0, 2.0, lambda x: x[0])}), "cloud": CLOUD}[what]  # fmt: skip
+    names = jax.tree_util.tree_map_with_path(lambda path, _: jax.tree_util.keystr(path), thing)
+    assert jax.tree.structure(names) == jax.tree.structure(thing)
+    stored = dict(zip(jax.tree.leaves(names), map(np.asarray, jax.tree.leaves(thing))))
+    back = jax.tree.map(stored.get, names)
+    assert len(stored) == len(jax.tree.leaves(thing)) and type(back) is type(thing)
+    if what == "solution":
+        points = np.array([[0.4]])
+        assert np.array_equal(back(points), solution(points)) and np.array_equal(back.u, solution.u)
+        assert np.array_equal(back.error_estimate(), solution.error_estimate())
+
+
 def test_reprs_are_short(solution):
     kernel = js.SuperGaussian(np.full(12, 0.1), 3.0)
-    for thing in (solution, CLOUD, PROBLEM, kernel, js.stencils(CLOUD, size=5), js.dirichlet(np.zeros(1000))):
+    things = (
+        solution, CLOUD, PROBLEM, kernel, js.stencils(CLOUD, size=5), js.dirichlet(np.zeros(1000)), js.free(),
+        js.quality(CLOUD), js.factorize(PROBLEM, CLOUD),
+    )  # fmt: skip
+    for thing in things:
         assert len(repr(thing)) < 200 and "\n" not in repr(thing), repr(thing)
 
 
