@@ -7,6 +7,7 @@ s = (x_g - x_i) / l, scaled by a length l of the support, so nothing here knows 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import jax
@@ -126,7 +127,19 @@ def eliminate(scheme: Scheme, jac: Any, length: Any) -> Elimination:
 
 
 def eliminate_on_host(scheme: Scheme, jac: np.ndarray) -> Elimination:
-    """:func:`eliminate` at unit length in numpy, where one elimination serves all particles."""
+    """:func:`eliminate` at unit length in numpy, where one elimination serves all particles; kept for the next solve."""
+    return _eliminated_once(scheme, jac.tobytes(), jac.shape, jac.dtype.str)
+
+
+@lru_cache(maxsize=32)
+def _eliminated_once(scheme: Scheme, numbers: bytes, shape: tuple[int, ...], dtype: str) -> Elimination:
+    made = _eliminated(scheme, np.frombuffer(numbers, dtype).reshape(shape))
+    for part in made:
+        part.setflags(write=False)
+    return made
+
+
+def _eliminated(scheme: Scheme, jac: np.ndarray) -> Elimination:
     rec = scheme.rec
     matrix, lift = constraints(rec, jac, 1.0, np)
     rows = matrix[np.array(rec.equation_rows)]
