@@ -127,7 +127,7 @@ def eliminate(scheme: Scheme, jac: Any, length: Any) -> Elimination:
 
 
 def eliminate_on_host(scheme: Scheme, jac: np.ndarray) -> Elimination:
-    """:func:`eliminate` at unit length in numpy, where one elimination serves all particles; kept for the next solve."""
+    """:func:`eliminate` at unit length in numpy, where one elimination serves all particles; kept for later."""
     return _eliminated_once(scheme, jac.tobytes(), jac.shape, jac.dtype.str)
 
 

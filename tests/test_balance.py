@@ -1,0 +1,55 @@
+"""Neumann data all around: solved up to a constant where they balance, refused where they do not.
+
+What a discretisation leaves of balanced data is not known beforehand; it falls with the order, as a
+true imbalance does not.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jsmitsm as js
+
+
+def exact(x):
+    return jnp.sin(3 * x[0] + 0.4) * jnp.cos(2 * x[1]) + 0.3 * x[0] ** 2
+
+
+def problem(cloud, excess):
+    """The source too large by a part ``excess``."""
+    slope = js.condition(lambda u, x, n: n @ (js.grad(u)(x) - js.grad(exact)(x)))
+    pde = lambda u, x: js.laplacian(u)(x) - (1.0 + excess) * js.laplacian(exact)(x)
+    return js.Problem(pde, {name: slope for name in cloud.groups if name != "interior"})
+
+
+CLOUDS = {
+    "square": js.rectangle((0, 0), (1, 1.3), (17, 21), jitter=0.25),
+    "corner": js.from_polygon([(0, 0), (2, 0), (2, 1), (1, 1), (1, 2), (0, 2)], 0.1),
+}
+
+
+@pytest.mark.parametrize("name", CLOUDS)
+@pytest.mark.parametrize("order, unseen, seen", [(4, 1e-5, 5e-3), (6, 1e-6, 1e-4)])
+def test_only_data_that_balance_are_solved(name, order, unseen, seen):
+    """An excess ``seen`` is larger than what the discretisation leaves on these clouds, ``unseen`` is not."""
+    cloud = CLOUDS[name]
+    values = np.array(jax.vmap(exact)(jnp.asarray(cloud.points)))
+    values -= values.mean()
+    for excess in (0.0, unseen):
+        sol = js.solve(problem(cloud, excess), cloud, order=order)
+        assert abs(float(sol.u.mean())) < 1e-12
+        assert "its mean over the particles is 0" in sol.diagnose()
+        assert np.linalg.norm(sol.u - values) < 1e-2 * np.linalg.norm(values)
+    with pytest.raises(js.SolveError, match="do not balance.*hold a value"):
+        js.solve(problem(cloud, seen), cloud, order=order)
+    told = js.solve(problem(cloud, seen), cloud, order=order, throw=False)
+    assert not told.converged and any("do not balance" in flag for flag in told.flags)
+
+
+def test_a_factorisation_judges_each_right_side():
+    cloud = CLOUDS["square"]
+    ready = js.factorize(problem(cloud, 0.0), cloud)
+    assert ready.solve(problem(cloud, 0.0)).converged
+    with pytest.raises(js.SolveError, match="do not balance"):
+        ready.solve(problem(cloud, 5e-3))
