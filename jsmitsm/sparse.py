@@ -82,6 +82,7 @@ class Factor:
 
     Raises:
       SingularMatrix: entries that are not finite, empty rows or columns, a singular matrix.
+      SolveError: factors that would not fit in memory, before any of it is taken.
 
     Example:
       >>> import numpy as np
@@ -307,7 +308,8 @@ def choose_backends(n: int, nnz: int, points: np.ndarray | None, solver: str, el
     # Without coordinates there is no good order, so the direct solver finds its own.
     direct = ["colamd"] if points is None or n <= DENSE_MAX else ["nested dissection", "colamd"]
     dim = 2 if points is None else points.shape[1]
-    too_large = estimate_memory(n, nnz, dim) > 0.8 * _memory()
+    needed, there = estimate_memory(n, nnz, dim), _memory()
+    too_large = needed > 0.8 * there
     iterative = ["amg"] if installed("pyamg") else ["ilu"]
     bordered = points is not None and bool(np.isnan(points).any())
     if solver == "auto" and elliptic and not bordered:
@@ -315,15 +317,27 @@ def choose_backends(n: int, nnz: int, points: np.ndarray | None, solver: str, el
             solver = "iterative"
     if solver == "iterative":
         return iterative if too_large else iterative + direct
+    if too_large:
+        raise SolveError(
+            f"the direct solver would need about {needed / 1e9:.1f} GB for {n} unknowns, of {there / 1e9:.1f} GB of "
+            'memory; use solver="iterative", fewer particles or a lower order'
+        )
     return direct
 
 
 def _memory() -> float:
-    """Bytes of the machine's memory; infinite where it cannot be known."""
+    """Bytes of memory that the machine, or the container, has; infinite where it cannot be known."""
+    sizes = [float("inf")]
     try:
-        return float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+        sizes.append(float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")))
     except (AttributeError, ValueError, OSError):
-        return float("inf")
+        pass
+    try:
+        with open("/sys/fs/cgroup/memory.max") as limit:
+            sizes.append(float(limit.read()))
+    except (OSError, ValueError):  # no such limit, or "max"
+        pass
+    return min(sizes)
 
 
 def _scales(

@@ -507,6 +507,22 @@ def test_refinement_reaches_roundoff():
     assert errors[1] < 1e-15 < errors[0]
 
 
+def test_what_does_not_fit_in_memory_is_refused(monkeypatch):
+    """By estimate, before the factors are allocated; iteration, which needs little, stays allowed."""
+    import jsmitsm as js
+    from jsmitsm import sparse
+
+    cloud = js.rectangle((0, 0), (1, 1), (25, 25), jitter=0.2)
+    sides = {side: js.dirichlet(lambda x: x[0]) for side in ("left", "right", "bottom", "top")}
+    problem = js.Problem(lambda u, x: js.laplacian(u)(x), sides)
+    js.solve(problem, cloud, solver="sparse")
+    linsolve.clear_cache()
+    monkeypatch.setattr(sparse, "_memory", lambda: 1e6)
+    with pytest.raises(js.SolveError, match=r'about 0\.0 GB for 529 unknowns.*solver="iterative"'):
+        js.solve(problem, cloud, solver="sparse")
+    assert js.solve(problem, cloud, solver="iterative").converged
+
+
 def test_memory_estimate():
     """Within a factor of two of the measured factor (8 bytes an entry and the row numbers)."""
     data, rows, cols, points = grid(60)
