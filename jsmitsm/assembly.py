@@ -25,7 +25,7 @@ from jsmitsm.recursion import row_levels
 _BLOCK = 64
 # So few particles are always padded to as many, and their programs compiled without optimisation:
 # that takes half the time, and what it costs in running is less than a millisecond.
-_FEW = 128
+_FEW, _VERY_FEW = 128, 16
 _QUICKLY = {"xla_backend_optimization_level": 0}
 
 # How often the local phase was compiled; read by the tests.
@@ -51,7 +51,7 @@ def padded_size(n: int) -> int:
     """The size class of n particles: shapes repeat between clouds of similar size, so that a
     compiled program serves the next cloud too; at most one part in eight is wasted."""
     if n <= _FEW:
-        return _FEW
+        return _FEW if n > _VERY_FEW else _VERY_FEW
     step = max(_BLOCK, 1 << ((n - 1).bit_length() - 4))
     return -(-n // step) * step
 

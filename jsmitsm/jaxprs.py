@@ -43,8 +43,13 @@ def bind(eqn: Any, *args: Any) -> list[Any]:
     return list(out) if eqn.primitive.multiple_results else [out]
 
 
-def levels(jaxpr: Any, wanted: Sequence[int]) -> list[tuple[Any, int]]:
+def levels(jaxpr: Any, wanted: Sequence[int]) -> tuple[tuple[Any, int], ...]:
     """The operations the wanted outputs need, in order, and how much of each."""
+    return _levels(jaxpr, tuple(wanted))
+
+
+@lru_cache(maxsize=1024)
+def _levels(jaxpr: Any, wanted: tuple[int, ...]) -> tuple[tuple[Any, int], ...]:
     need: dict[Any, int] = {}
 
     def ask(v: Any, level: int) -> None:
@@ -62,7 +67,7 @@ def levels(jaxpr: Any, wanted: Sequence[int]) -> list[tuple[Any, int]]:
         name = eqn.primitive.name
         for k, v in enumerate(eqn.invars):
             ask(v, _operand_level(eqn, name, k, level))
-    return kept[::-1]
+    return tuple(kept[::-1])
 
 
 def _operand_level(eqn: Any, name: str, k: int, level: int) -> int:

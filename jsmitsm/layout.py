@@ -13,13 +13,15 @@ from jsmitsm.boundary import Group, group_conditions, is_traced
 from jsmitsm.clouds import Cloud
 from jsmitsm.kernels import EDGE, Constant, Gaussian, Kernel
 from jsmitsm.moments import Scheme
-from jsmitsm.neighbours import Stencils, in_line, nearest, within
+from jsmitsm.neighbours import Stencils, evenly_spaced, in_line, nearest, within
 from jsmitsm.periodic import Images, periodic_images
 from jsmitsm.problem import Problem
 from jsmitsm.recursion import Recursion, free_indices, recursion
 from jsmitsm.trace import Traced, trace
 
 METHODS = ("I", "II", "III", "S", "SSPH")
+# Neighbours for every free coefficient, by the order of the expansions, where the particles are evenly spaced.
+_EVEN_RATIO = {4: 1.5, 5: 1.5, 6: 1.5, 7: 1.65, 8: 1.65}
 
 
 @dataclass
@@ -115,7 +117,7 @@ def discretize(
         )
     given_stencils = stencils is not None
     if stencils is None:
-        stencils = find_stencils(cloud, kernel, default_size(scheme), scheme_size(scheme), images)
+        stencils = find_stencils(cloud, kernel, scheme, images)
     elif len(stencils) != len(cloud):
         raise ValueError(f"stencils: built for {len(stencils)} particles, the cloud has {len(cloud)}; build them again")
     if kernel is None and method in ("I", "II"):
@@ -281,16 +283,21 @@ def scheme_size(scheme: Scheme) -> int:
     return -(-(rec.fields * rec.size - rec.n_rows) // rec.fields)
 
 
-def default_size(scheme: Scheme) -> int:
-    """Neighbours, the particle itself counted, that make a good fit."""
-    free = scheme_size(scheme)
-    return min(2 * free + 2, 5) if scheme.rec.dim == 1 and scheme.rec.fields == 1 else 2 * free + 2
+def default_size(scheme: Scheme, even: bool = False) -> int:
+    """Neighbours, the particle itself counted, that make a good fit.
+
+    even: the particles keep their distance from one another. There smaller stencils of method S have errors two to
+    three times smaller; elsewhere, and at high orders near boundaries, too many of them would be weak.
+    """
+    free, rec = scheme_size(scheme), scheme.rec
+    if rec.dim == 1 and rec.fields == 1:
+        return min(2 * free + 2, 5)
+    ratio = _EVEN_RATIO.get(rec.order, 2.0) if even and scheme.method == "S" and rec.dim > 1 else 2.0
+    return round(ratio * free) + 2
 
 
-def find_stencils(
-    cloud: Cloud, kernel: Kernel | None, size: int, needed: int, images: Images | None = None
-) -> Stencils:
-    """Neighbours from the kernel's support, or the nearest ``size`` without a kernel."""
+def find_stencils(cloud: Cloud, kernel: Kernel | None, scheme: Scheme, images: Images | None = None) -> Stencils:
+    """Neighbours from the kernel's support, or as many of the nearest as the method needs without a kernel."""
     if is_traced(cloud.points) or is_traced(kernel):
         what = "kernel's h or d" if is_traced(kernel) else "points"
         raise ValueError(
@@ -300,12 +307,14 @@ def find_stencils(
     points = np.asarray(cloud.points) if images is None else images.searched(np.asarray(cloud.points))
     which = None if images is None or not len(images.owner) else np.arange(len(cloud))
     if kernel is None:
+        needed = scheme_size(scheme)
         if len(points) < needed + 1:
             raise ValueError(
                 f"cloud: {len(points)} particles are too few for this order, which needs at least {needed + 1} "
                 "in every stencil; lower the order or add particles"
             )
-        return (in_line if cloud.dim == 1 else nearest)(points, min(size, len(points)), which)
+        size = min(default_size(scheme, scheme.method == "S" and evenly_spaced(points)), len(points))
+        return (in_line if cloud.dim == 1 else nearest)(points, size, which)
     return within(points, np.asarray(kernel.d) * np.asarray(kernel.h), which)
 
 

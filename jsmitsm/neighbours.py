@@ -10,9 +10,19 @@ import numpy as np
 
 from jsmitsm.clouds import Cloud
 from jsmitsm.kernels import EDGE
+from jsmitsm.threads import cores
 
 # Neighbours at the same distance up to this enter together: rounding must not choose among them.
 _TIE = 1e-7
+# So many ties, or half of a stencil, are looked for at the most; further ones are found by a search within the radius.
+_MOST_TIES = 4
+# Particles that tell how many ties there are, and (four times as many) whether the cloud is evenly spaced.
+_SAMPLE = 16
+# The nearest neighbour is farther than this part of the spacing around 90 % of the particles of an even cloud: 0.57 on
+# a lattice jittered by 0.3 spacings, 0.67 and more on relaxed clouds, 0.36 on Halton's points, 0.18 on random ones.
+_EVEN = 0.5
+# Searches for fewer particles are done before a second core would have begun.
+_MANY = 4000
 
 
 @jax.tree_util.register_dataclass
@@ -88,18 +98,67 @@ def nearest(points: np.ndarray, size: int, which: np.ndarray | None = None) -> S
             f"size: {size} neighbours asked for, but the cloud has only {n} particles; lower the order or add particles"
         )
     centres = points if which is None else points[which]
-    from scipy.spatial import cKDTree
-
-    tree = cKDTree(points)
-    extra = min(n, size + max(4, size // 2))
-    distance, index = tree.query(centres, k=extra)
+    tree = _tree(points)
+    distance, index = _with_ties(tree, centres, size)
     radius = distance[:, size - 1] * (1 + _TIE)
     inside = distance <= radius[:, None]
-    if inside[:, -1].any() and extra < n:  # more ties than were looked for
+    if inside[:, -1].any() and distance.shape[1] < n:  # more ties than were looked for
         return _ragged(tree, centres, radius, which)
     width = int(inside.sum(axis=1).max())
-    index = np.where(inside, index, -1)[:, :width].astype(np.int32)
+    index = np.where(inside[:, :width], index[:, :width], -1).astype(np.int32)
     return Stencils(_self_first(index, which), radius)
+
+
+def _with_ties(tree: Any, centres: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Distances and numbers of the ``size`` nearest particles and of the next ones, up to all ties: (n, m)."""
+    most = min(tree.n, size + max(_MOST_TIES, size // 2))
+    sample, _ = _query(tree, _sampled(centres, _SAMPLE), most)
+    ties = (sample[:, size:] <= sample[:, size - 1 : size] * (1 + _TIE)).sum(axis=1).max(initial=0)
+    count = min(most, size + 1 + int(ties))
+    distance, index = _query(tree, centres, count)
+    left = np.flatnonzero(distance[:, -1] <= distance[:, size - 1] * (1 + _TIE))
+    if len(left) and count < most:
+        wider = ((0, 0), (0, most - count))
+        distance, index = np.pad(distance, wider, constant_values=np.inf), np.pad(index, wider)
+        distance[left], index[left] = _query(tree, centres[left], most)
+    return distance, index
+
+
+def _sampled(points: np.ndarray, count: int) -> np.ndarray:
+    return points[np.linspace(0, len(points) - 1, min(len(points), count)).astype(int)]
+
+
+def evenly_spaced(points: np.ndarray) -> bool:
+    """Whether the particles keep their distance from one another, as those of lattices and relaxed clouds do.
+
+    Judged by the distance of the nearest neighbour, in a sample, relative to the spacing around it.
+    """
+    count = min(3 ** points.shape[1], len(points) - 1)
+    distance, _ = _query(_tree(points), _sampled(points, 4 * _SAMPLE), count + 1)
+    volume = {1: 2.0, 2: np.pi, 3: 4.0 * np.pi / 3.0}[points.shape[1]]
+    spacing = distance[:, -1] * (volume / (count + 1)) ** (1.0 / points.shape[1])
+    return bool(np.quantile(distance[:, 1] / np.where(spacing > 0, spacing, 1.0), 0.1) > _EVEN)
+
+
+def _tree(points: np.ndarray) -> Any:
+    from scipy.spatial import cKDTree
+
+    # Cells halved at their middle instead of at the median: built in half the time, searched as fast.
+    return cKDTree(points, balanced_tree=False, compact_nodes=False)
+
+
+def _query(tree: Any, centres: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Distances and numbers of the ``count`` nearest particles of every centre, (n, count)."""
+    n = len(centres)
+    workers = cores() if n >= _MANY else 1
+    if n < _MANY or n != tree.n:
+        return tree.query(centres, k=count, workers=workers)
+    # In the order of the tree's leaves: the search finds in the cache what it found for the centre before.
+    order = tree.indices
+    found = tree.query(centres[order], k=count, workers=workers)
+    distance, index = np.empty_like(found[0]), np.empty_like(found[1])
+    distance[order], index[order] = found
+    return distance, index
 
 
 def in_line(points: np.ndarray, size: int, which: np.ndarray | None = None) -> Stencils:
@@ -127,9 +186,7 @@ def within(points: np.ndarray, radius: Any, which: np.ndarray | None = None) -> 
         raise ValueError(f"radius: expected a positive scalar or ({len(centres)},) array, got {radius!r}") from None
     if radius.shape not in ((), (len(centres),)) or not (np.isfinite(radius) & (radius > 0)).all():
         raise ValueError(f"radius: expected a positive scalar or ({len(centres)},) array, got shape {radius.shape}")
-    from scipy.spatial import cKDTree
-
-    return _ragged(cKDTree(points), centres, np.broadcast_to(radius * EDGE, (len(centres),)), which)
+    return _ragged(_tree(points), centres, np.broadcast_to(radius * EDGE, (len(centres),)), which)
 
 
 def _ragged(tree, centres: np.ndarray, radius: np.ndarray, which: np.ndarray | None) -> Stencils:

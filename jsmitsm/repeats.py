@@ -43,30 +43,31 @@ def repeats(points: np.ndarray, ids: np.ndarray, neighbours: np.ndarray, own: np
     if len(first) > n // 4:
         return None
     neighbours = np.take_along_axis(neighbours, order, axis=1)
-    offset = _offsets(points, ids, neighbours)
-    away = np.abs(offset - offset[first][of]).max()
+    away = max(np.abs(x - x[first][of]).max() for x in _offsets(points, ids, neighbours))
     same = np.array_equal(neighbours >= 0, (neighbours >= 0)[first][of])
     if away > _ROUNDING * np.abs(points).max() or not same or not np.allclose(own, own[first][of], 1e-14, 1e-14):
         return None
     return Repeats(first, of, neighbours)
 
 
-def _offsets(points: np.ndarray, ids: np.ndarray, neighbours: np.ndarray) -> np.ndarray:
-    return points[np.where(neighbours >= 0, neighbours, ids[:, None])] - points[ids][:, None]
+def _offsets(points: np.ndarray, ids: np.ndarray, neighbours: np.ndarray) -> list[np.ndarray]:
+    """The neighbours' offsets, (n, w) for each axis; 0 where there is none."""
+    near = np.where(neighbours >= 0, neighbours, ids[:, None])
+    return [x[near] - x[ids][:, None] for x in np.ascontiguousarray(points.T)]
 
 
 def _codes(points: np.ndarray, ids: np.ndarray, neighbours: np.ndarray, own: np.ndarray) -> tuple[np.ndarray, ...]:
     """An order of each particle's neighbours, and a number for the whole, equal for equal stencils."""
-    offset = _offsets(points, ids, neighbours)
-    distance = np.abs(offset).max(axis=2)
+    offsets = _offsets(points, ids, neighbours)
+    distance = np.maximum.reduce([np.abs(x) for x in offsets])
     unit = _UNIT * distance[distance > 0].min()
     factors = np.random.default_rng(0).integers(1 << 62, size=points.shape[1]) | 1
     with np.errstate(over="ignore"):
         # Products wrap around: a hash of the offset.
-        code = (np.rint(offset / unit).astype(np.int64) * factors).sum(axis=2)
+        code = sum(np.rint(x * (1.0 / unit)).astype(np.int64) * f for x, f in zip(offsets, factors))
         code = np.where(neighbours >= 0, code, np.iinfo(np.int64).max)
         code[:, 0] = np.iinfo(np.int64).min
-        order = np.argsort(code, axis=1, kind="stable")
+        order = np.argsort(code, axis=1)  # equal codes are those of empty places
         mixed = (code ^ (code >> 29)) * np.int64(0x3F58476D1CE4E5B9)
         total = (mixed ^ (mixed >> 32)).sum(axis=1)
         flat = np.rint(own.reshape(len(own), -1) * 1e12).astype(np.int64)

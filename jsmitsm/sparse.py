@@ -12,6 +12,7 @@ from __future__ import annotations
 import os
 import threading
 import time
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -325,6 +326,7 @@ def choose_backends(n: int, nnz: int, points: np.ndarray | None, solver: str, el
     return direct
 
 
+@cache
 def _memory() -> float:
     """Bytes of memory that the machine, or the container, has; infinite where it cannot be known."""
     sizes = [float("inf")]
