@@ -23,10 +23,15 @@ from jsmitsm.recursion import row_levels
 
 # Particles per block: larger blocks leave the cache and are several times slower.
 _BLOCK = 64
-# So few particles are always padded to as many, and their programs compiled without optimisation:
-# that takes half the time, and what it costs in running is less than a millisecond.
+# So few particles are always padded to as many.
 _FEW, _VERY_FEW = 128, 16
-_QUICKLY = {"xla_backend_optimization_level": 0}
+# Up to so many particles a program is compiled with less effort, in a half or a sixth of the time; what that costs in
+# running is about a millisecond a call.
+_PLAIN: Any = {"xla_cpu_use_fusion_emitters": False, "xla_cpu_parallel_codegen_split_count": 1}
+_EFFORT = (
+    (_FEW, _PLAIN | {"xla_backend_optimization_level": 0}),
+    (2048, _PLAIN | {"xla_backend_optimization_level": 1}),
+)
 
 # How often the local phase was compiled; read by the tests.
 TRACES = {"rows": 0, "coefficients": 0}
@@ -68,7 +73,7 @@ def _in_size_classes(function: Any) -> Any:
     """Compile ``function(scheme, points, kernel, ids, neighbours, operands, each, whole)``, and call it
     with every particle axis padded: that of ``ids``, and that of the cloud."""
     program = jax.jit(function, static_argnums=(0,))
-    quick = jax.jit(function, static_argnums=(0,), compiler_options=_QUICKLY)
+    quick = [(most, jax.jit(function, static_argnums=(0,), compiler_options=options)) for most, options in _EFFORT]
 
     @wraps(function)
     def padded(scheme, points, kernel, ids, neighbours, operands, each=(), whole=()):
@@ -82,7 +87,10 @@ def _in_size_classes(function: Any) -> Any:
             cloud_wide(points), cloud_wide(kernel), class_wide(ids), class_wide(neighbours), given,
             class_wide(each), cloud_wide(whole),
         )  # fmt: skip
-        made = (quick if size <= _FEW and not _inside(arguments) else program)(scheme, *arguments)
+        run = program
+        if jax.default_backend() == "cpu" and not _inside(arguments):
+            run = next((some for most, some in quick if size <= most), program)
+        made = run(scheme, *arguments)
         # Cut on the host where nothing is traced: an eager slice would compile for every length.
         return jax.tree.map(lambda x: (x if isinstance(x, jax.core.Tracer) else np.asarray(x))[:m], made)
 
@@ -91,8 +99,8 @@ def _in_size_classes(function: Any) -> Any:
 
 def _inside(arguments: Any) -> bool:
     """Whether the call is part of a larger program: an inner one has no compiler options of its own."""
-    # Under jit every operation is recorded, one on constants too.
-    return is_traced(arguments, jnp.zeros(()))
+    # Under jit every operation is recorded, one on constants too; this one compiles nothing elsewhere.
+    return is_traced(arguments, jnp.asarray(np.zeros(())))
 
 
 @_in_size_classes

@@ -95,7 +95,7 @@ def in_pieces(what: str, one: Callable[[Any], Any], cls: Any, *context: Any) -> 
     The results are pytrees with the particle axis first; nothing is cut up where ``context`` is traced.
     """
     n = len(cls.ids)
-    if n <= 2 * PIECE or not watched() or is_traced(context, cls.neighbours, jnp.zeros(())):
+    if n <= 2 * PIECE or not watched() or is_traced(context, cls.neighbours, jnp.asarray(np.zeros(()))):
         return one(cls)
     made = []
     step = -(-n // -(-n // PIECE))  # pieces of one size: one program serves all
