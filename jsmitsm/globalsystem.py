@@ -66,7 +66,9 @@ def right_side(disc: Discretization, nums: Numbers, classes: list[Class], rows: 
         source, given = right_sides(disc, nums, cls)
         w, v, v_own = (xp.asarray(x) for x in (row.weights, row.source, row.condition))
         index = xp.maximum(disc.images.owners(cls.neighbours), 0)
-        total = xp.einsum("nfr,nr->nf", v, source) + xp.einsum("nfk,nk->nf", v_own, given) + row.constant
+        total = xp.einsum("nfk,nk->nf", v_own, given) + row.constant
+        if cls.scheme.sourced:
+            total = total + xp.einsum("nfr,nr->nf", v, source)
         total = total + xp.einsum("nfgh,ngh->nf", w, xp.asarray(nums.held)[index])
         if disc.scheme.n_data:
             total = total + xp.einsum("nfgd,ngd->nf", xp.asarray(row.data), xp.asarray(nums.gamma)[index])

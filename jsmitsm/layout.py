@@ -87,9 +87,12 @@ class Discretization:
 
 def discretize(
     problem: Problem, cloud: Cloud, method: str, order: int, kernel: Kernel | None,
-    stencils: Stencils | None, basis_terms: int | None,
+    stencils: Stencils | None, basis_terms: int | None, sources: bool = True,
 ) -> Discretization:  # fmt: skip
-    """Trace the problem, lay out its recursion and conditions, and find neighbours."""
+    """Trace the problem, lay out its recursion and conditions, and find neighbours.
+
+    sources: whether the weights of the source are wanted even where it is zero.
+    """
     traced = _traced(problem, cloud.dim)
     _check_operator(traced, problem, order)
     rec = recursion(cloud.dim, order, problem.fields, traced.slots, traced.pattern, traced.order)
@@ -104,7 +107,8 @@ def discretize(
     for group in groups:
         n_own[group.ids] = group.n_rows + len(group.held)
     scheme = _scheme(method, rec, traced, problem, cloud, basis_terms)
-    scheme = replace(scheme, **_conditions_layout(groups, rec))
+    sourced = sources or not traced.linear or traced.source != "zero"
+    scheme = replace(scheme, **_conditions_layout(groups, rec), sourced=sourced)
     if len(images.owner) and method in ("I", "II"):
         raise ValueError(f"method: {method} does not follow periodic conditions; use S, III or SSPH")
     if kernel is not None and not is_traced(kernel) and np.shape(kernel.h) not in ((), (len(cloud),)):

@@ -30,6 +30,7 @@ class Scheme:
     free, dependent : positions of the paper's free and dependent coefficients (I, II, III).
     own : slots of the particle's own boundary conditions, and their number.
     data : slots of the conditions that neighbours contribute as data, and their number.
+    sourced : whether the source's weights are wanted.
     """
 
     method: str
@@ -40,6 +41,7 @@ class Scheme:
     n_own: int = 0
     data: tuple[Slot, ...] = ()
     n_data: int = 0
+    sourced: bool = True
 
 
 class Elimination(NamedTuple):
@@ -246,6 +248,8 @@ def functional(scheme: Scheme, near: Support, system: System, wanted: Any) -> tu
     w = _fit(scheme, system.weight, system.phi, system.tests, target)
     size = jnp.max(jnp.abs(target), initial=0.0)
     defect = jnp.max(jnp.abs(system.phi.T @ w - target), initial=0.0) / jnp.where(size > 0, size, 1.0)
+    if not (scheme.sourced or scheme.n_own):
+        return w, jnp.zeros((scheme.rec.n_rows, wanted.shape[0])), jnp.zeros((0, wanted.shape[0])), defect
     rest = wanted.T - system.values.T @ w
     v_own = system.own_solve.T @ (system.elimination.basis.T @ rest)
     v = system.elimination.particular.T @ (rest - system.own_rows.T @ v_own)

@@ -110,7 +110,7 @@ def solve(
     """
     start = time.perf_counter()
     _check(problem, cloud, method, order, kernel, stencils, formulation, solver, u0, throw)
-    disc = dz.discretize(problem, cloud, method, order, kernel, stencils, basis_terms)
+    disc = dz.discretize(problem, cloud, method, order, kernel, stencils, basis_terms, sources=False)
     run = Run(disc, problem, solver, throw, kernel is None and stencils is None, formulation)
     run.seconds["set-up"] = time.perf_counter() - start
     if formulation == "lsq" and method != "S":

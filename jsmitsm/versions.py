@@ -9,7 +9,7 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 _NEEDED = ("jax", "jaxlib", "numpy", "scipy", "optax")
-_EXTRAS = ("matplotlib", "meshio", "shapely", "pandas", "xarray", "pyamg", "tqdm")
+_EXTRAS = ("matplotlib", "meshio", "shapely", "pandas", "xarray", "pyamg", "pypardiso", "tqdm")
 
 
 def show_versions(file: Any = None) -> None:

@@ -456,6 +456,23 @@ def test_auto_takes_multigrid_for_large_elliptic_problems_only(monkeypatch):
     assert first(bordered, True) == "nested dissection"
 
 
+def test_pardiso_where_installed(monkeypatch):
+    pytest.importorskip("pypardiso")
+    monkeypatch.setattr(sparse, "PARDISO_MIN", {2: 350})
+    monkeypatch.setattr(sparse, "cores", lambda: 2)
+    data, rows, cols, points = grid(20)
+    data = data * (1 + 0.1 * np.sin(np.arange(len(data))))  # not symmetric
+    f = sparse.Factor(data, rows, cols, 400, points, "sparse")
+    assert f.info["backend"] == "pardiso" and f.info["factor_entries"] > len(data)
+    matrix, b = full(data, rows, cols, 400), np.random.default_rng(0).random((400, 2))
+    np.testing.assert_allclose(matrix @ f.solve(b), b, atol=1e-12)
+    np.testing.assert_allclose(matrix.T @ f.solve(b, transpose=True), b, atol=1e-12)
+    matrix[8] = matrix[7]  # a pivot vanishes, which PARDISO replaces by a small number
+    rows, cols = np.nonzero(matrix)
+    with pytest.raises(SingularMatrix):
+        sparse.Factor(matrix[rows, cols], rows, cols, 400, points, "sparse")
+
+
 def test_stalled_iteration_falls_back(monkeypatch):
     data, rows, cols, points = grid(20)
     monkeypatch.setattr(backends.Krylov, "most", 2)
