@@ -19,7 +19,7 @@ import numpy as np
 
 from jsmitsm.progress import bar
 
-ITERATIVE = ("amg", "ilu")
+ITERATIVE = ("amg", "ilu", "float32 factors")
 
 
 @cache
@@ -56,20 +56,19 @@ class SuperLU:
     def __init__(self, matrix: Any, ordered: bool) -> None:
         from scipy.sparse.linalg import splu
 
-        if ordered:  # a low threshold keeps the pivots on the diagonal and so keeps the order
-            self.lu = splu(
-                matrix,
-                permc_spec="NATURAL",
-                diag_pivot_thresh=0.01,
-                options={"SymmetricMode": True},
-            )
-        else:
-            self.lu = splu(matrix)
+        self.lu = _in_order(matrix) if ordered else splu(matrix)
         self.entries = self.lu.nnz
 
     def apply(self, b: np.ndarray, transpose: bool) -> np.ndarray:
         """Solve, (n, m) to (n, m)."""
         return self.lu.solve(b, "T" if transpose else "N")
+
+
+def _in_order(matrix: Any) -> Any:
+    """SuperLU's factors of a matrix in a good order: a low threshold keeps the pivots on the diagonal."""
+    from scipy.sparse.linalg import splu
+
+    return splu(matrix, permc_spec="NATURAL", diag_pivot_thresh=0.01, options={"SymmetricMode": True})
 
 
 @cache
@@ -245,10 +244,33 @@ class ILU(Krylov):
         return lambda v: self.lu.solve(v, mode)
 
 
+class Mixed(Krylov):
+    """LU in float32 as the preconditioner, everything else in float64: two iterations unless the matrix is
+    ill-conditioned, in two thirds of the memory of LU in float64 and of its time."""
+
+    most = 10
+
+    def __init__(self, matrix: Any) -> None:
+        super().__init__(matrix)
+        self.lu = _in_order(matrix.astype(np.float32))
+        self.entries = self.lu.nnz
+
+    def preconditioner(self, transpose: bool) -> Callable[[np.ndarray], np.ndarray]:
+        """Triangular solves, of a right-hand side brought to the size of one: float32 ends at 1e38."""
+        mode = "T" if transpose else "N"
+
+        def guess(v: np.ndarray) -> np.ndarray:
+            size = float(abs(v).max()) or 1.0
+            return self.lu.solve((v / size).astype(np.float32), mode) * size
+
+        return guess
+
+
 BACKENDS: dict[str, Callable[[Any], Any]] = {
     "lapack": Lapack,
     "nested dissection": lambda matrix: SuperLU(matrix, ordered=True),
     "pardiso": Pardiso,
+    "float32 factors": Mixed,
     "colamd": lambda matrix: SuperLU(matrix, ordered=False),
     "amg": AMG,
     "ilu": ILU,

@@ -45,7 +45,7 @@ __all__ = [
     "solve",
 ]
 
-SOLVERS = ("auto", "dense", "sparse", "iterative")
+SOLVERS = ("auto", "dense", "sparse", "mixed", "iterative")
 
 
 def solve(
@@ -71,10 +71,11 @@ def solve(
       points: (n, D) concrete coordinates of the unknowns, or None. They serve the order of
         elimination (two to three times faster, half the memory); a row of NaN, as for a Lagrange
         multiplier, is an unknown without a place and is eliminated last.
-      solver: "dense" (LAPACK; pure JAX where anything is traced), "sparse" (LU), "iterative"
-        (BiCGSTAB with multigrid, where pyamg is installed, or incomplete LU; it falls back to the
-        direct solver where it stalls) or "auto": dense up to 190 unknowns, then direct, and
-        multigrid for the large elliptic systems where it was measured to be faster.
+      solver: "dense" (LAPACK; pure JAX where anything is traced), "sparse" (LU, by PARDISO where that is
+        installed and faster), "mixed" (LU in float32, corrected to float64 by BiCGSTAB), "iterative"
+        (BiCGSTAB with multigrid, where pyamg is installed, or incomplete LU) or "auto": dense up to 190
+        unknowns, then LU, mixed and multigrid for the elliptic systems that are large enough for them
+        to be faster. Mixed and iterative fall back to LU where they stall.
       elliptic: False keeps "auto" away from multigrid.
       refine: steps of iterative refinement done in any case; 0 switches it off.
       info: a dict to be filled with what was done (`Factor.info`, and "cached"), where nothing is

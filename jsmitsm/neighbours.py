@@ -109,6 +109,16 @@ def nearest(points: np.ndarray, size: int, which: np.ndarray | None = None) -> S
     return Stencils(_self_first(index, which), radius)
 
 
+def replaced(stencils: Stencils, ids: np.ndarray, others: Stencils) -> Stencils:
+    """The stencils with those of the particles ``ids`` taken from ``others``, one for each of them."""
+    width = max(stencils.width, others.width)
+    indices, radius = np.full((len(stencils), width), -1, np.int32), np.array(stencils.radius)
+    indices[:, : stencils.width] = stencils.indices
+    indices[ids] = np.pad(others.indices, ((0, 0), (0, width - others.width)), constant_values=-1)
+    radius[ids] = others.radius
+    return Stencils(indices, radius)
+
+
 def _with_ties(tree: Any, centres: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
     """Distances and numbers of the ``size`` nearest particles and of the next ones, up to all ties: (n, m)."""
     most = min(tree.n, size + max(_MOST_TIES, size // 2))

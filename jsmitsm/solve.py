@@ -13,6 +13,7 @@ from jsmitsm.boundary import is_traced
 from jsmitsm.clouds import Cloud
 from jsmitsm.discretize import Discretization
 from jsmitsm.kernels import Kernel
+from jsmitsm.linsolve import SOLVERS
 from jsmitsm.neighbours import Stencils
 from jsmitsm.newton import newton
 from jsmitsm.problem import Problem
@@ -20,7 +21,6 @@ from jsmitsm.solution import Recipe, Solution
 from jsmitsm.system import Run
 
 METHODS = ("I", "II", "III", "S", "SSPH")
-SOLVERS = ("auto", "dense", "sparse", "iterative")
 
 
 @jax.tree_util.register_pytree_node_class
@@ -83,7 +83,8 @@ def solve(
     basis_terms : keep only the first so many free coefficients (I, II, III).
     formulation : "loo" (each value is predicted by its neighbours), "lsq" (least squares over
         all local fits) or "auto".
-    solver : "auto", "dense" (pure JAX), "sparse" (direct) or "iterative".
+    solver : "auto", "dense" (pure JAX), "sparse" (direct), "mixed" (direct, its factors in float32
+        and the rest in float64: two thirds of the time and memory) or "iterative".
     u0 : start of Newton's method for a nonlinear problem: (N,), (N, F) or a function of x.
     throw : raise :class:`jsmitsm.SolveError` where the solve fails; otherwise, and always under
         jit, ``converged`` is False.

@@ -27,8 +27,10 @@ from jsmitsm.threads import cores
 DENSE_MAX = 190
 # Unknowns from which multigrid was faster than LU, refined to round-off and with one adjoint solve.
 ITERATIVE_MIN = {2: 200_000, 3: 6_000}
-# Unknowns from which PARDISO on two cores was faster than SuperLU: 1.3 times in 2D, twice in 3D.
-PARDISO_MIN = {2: 50_000, 3: 2_000}
+# Unknowns from which factors in float32, with refinement, were faster than those in float64.
+MIXED_MIN = 30_000
+# Unknowns from which PARDISO on two cores was faster than either.
+PARDISO_MIN = {2: 200_000, 3: 2_000}
 BACKWARD_ERROR = 1e-9  # what is accepted of a direct solver
 BACKWARD_ERROR_ITERATIVE = 1e-12  # of an iterative one, which reaches round-off unless it stalls
 SINGULAR = 1e15  # condition number (scaled) above which no digit of a solution means anything
@@ -126,8 +128,8 @@ class Factor:
             "messages": self.messages,
         }
         self._backends = choose_backends(n, len(data), points, solver, elliptic)
-        krylov = self._backends[0] in ITERATIVE
-        self.row_scale, self.col_scale = _scales(data, rows, cols, n, columns=not krylov)
+        rows_only = self._backends[0] in ("amg", "ilu")  # multigrid lives on what is left of the symmetry
+        self.row_scale, self.col_scale = _scales(data, rows, cols, n, columns=not rows_only)
         scaled = data * self.row_scale[rows] * self.col_scale[cols]
         started = time.perf_counter()
         self.order = order
@@ -321,8 +323,12 @@ def choose_backends(n: int, nnz: int, points: np.ndarray | None, solver: str, el
     if solver == "auto" and elliptic and not bordered:
         if too_large or (n >= ITERATIVE_MIN.get(dim, n + 1) and iterative == ["amg"]):
             solver = "iterative"
+        elif n >= MIXED_MIN and direct[0] == "nested dissection":
+            solver = "mixed"
     if solver == "iterative":
         return iterative if too_large else iterative + direct
+    if solver == "mixed" and points is not None and n > DENSE_MAX and 0.7 * needed <= 0.8 * there:
+        return ["float32 factors"] if too_large else ["float32 factors", *direct]
     if too_large:
         raise SolveError(
             f"the direct solver would need about {needed / 1e9:.1f} GB for {n} unknowns, of {there / 1e9:.1f} GB of "

@@ -1,0 +1,200 @@
+"""What a scene does not need, with and without: ``python -m benchmarks.skipping``.
+
+Each line measures the same problem twice in one run: as the package solves it, and with one thing done that it left
+out. Seconds are medians of repeats after a first call that compiles, on clouds moved by a trifle each time.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jsmitsm as js
+from benchmarks import machine
+from jsmitsm import assembly, linsolve, repeats, rows
+from jsmitsm import discretize as dz
+from jsmitsm.solve import discretized
+from jsmitsm.taylor import count
+
+DATA = Path(__file__).parent / "data" / "skipping.json"
+REPEATS = 7
+SIDES = ("left", "right", "bottom", "top")
+SPACING = 0.01
+
+
+def wave(x: Any) -> Any:
+    return jnp.sin(2 * x[0] + 1) * jnp.cos(3 * x[1])
+
+
+def poisson(scale: float = 1.0) -> js.Problem:
+    """With a source and boundary values of this size; a fresh lambda each time."""
+    exact = lambda x: scale * wave(x)
+    return js.Problem(lambda u, x: js.laplacian(u)(x) - js.laplacian(exact)(x), dict.fromkeys(SIDES, js.dirichlet(exact)))
+
+
+def laplace() -> js.Problem:
+    return js.Problem(lambda u, x: js.laplacian(u)(x), dict.fromkeys(SIDES, js.dirichlet(lambda x: jnp.exp(x[0]) * jnp.sin(x[1]))))
+
+
+def scattered(k: int, side: int = 100) -> js.Cloud:
+    """Ten thousand jittered particles; another trifle for every k."""
+    cloud = js.rectangle((0, 0), (1, 1), (side, side), jitter=0.3)
+    return js.Cloud(np.asarray(cloud.points) * (1.0 + 1e-12 * k), cloud.groups, cloud.normals)
+
+
+def lattice(k: int) -> js.Cloud:
+    cloud = js.rectangle((0, 0), (1, 1), (100, 100))
+    return js.Cloud(np.asarray(cloud.points) * (1.0 + 1e-13 * k), cloud.groups, cloud.normals)
+
+
+def seconds(run: Callable[[int], Any]) -> float:
+    """The median after a first call."""
+    took = []
+    for k in range(REPEATS + 1):
+        start = time.perf_counter()
+        jax.block_until_ready(run(k))
+        took.append(time.perf_counter() - start)
+    return float(np.median(took[1:]))
+
+
+def local(problem: Callable[[], js.Problem], cloud: Callable[[int], js.Cloud], order: int, **options: Any) -> Callable[[int], Any]:
+    """The local phase alone."""
+    ready = {}
+
+    def run(k: int) -> Any:
+        return dz.all_rows(*ready[k])[1][0].weights
+
+    for k in range(REPEATS + 1):
+        disc = discretized(problem(), cloud(k), "S", order, **options)
+        ready[k] = disc, dz.numbers(disc, problem())
+    return run
+
+
+def patched(run: Callable[[int], Any], *patches: Any) -> Callable[[int], Any]:
+    def other(k: int) -> Any:
+        with ExitStack() as stack:
+            for patch in patches:
+                stack.enter_context(patch)
+            return run(k)
+
+    return other
+
+
+def lines() -> Iterator[tuple[str, str, float, float]]:
+    """(what is left out, where it was measured, seconds without it, seconds with it)."""
+    order = 6
+    bare = local(laplace, scattered, order)
+    yield "recursion of a constant operator for every particle", "local phase", *both(
+        bare, patched(_for_each(order), mock.patch.object(rows, "shared_elimination", lambda *a: None)))
+    yield "kernel derivatives (S needs none)", "local phase, III against S in one kernel", *both(
+        _rows_of("S"), _rows_of("III"))
+    yield "weights of a source that is zero", "local phase", *both(
+        patched(bare, mock.patch.object(assembly, "rows", _unsourced(assembly.rows))), bare)
+    yield "moment systems of repeated stencils", "local phase on a lattice", *both(
+        local(poisson, lattice, order), patched(local(poisson, lattice, order), mock.patch.object(repeats, "FEWEST", 10**9)))
+    disc = discretized(poisson(), scattered(0), "S", order)
+    held = np.flatnonzero(disc.held.all(axis=1))
+    inside = seconds(bare)
+    yield "rows of Dirichlet particles", f"local phase, {len(held)} of {len(disc.held)} particles", inside, inside * (
+        len(disc.held) / (len(disc.held) - len(held)))
+    solve = lambda k: js.solve(poisson(), scattered(k), order=order)
+    whole = seconds(lambda k: solve(k).u)
+    yield "Taylor coefficients of all particles", "solve", whole, seconds(lambda k: solve(k).coefficients)
+    yield "error estimate", "solve", whole, seconds(lambda k: solve(k).error_estimate())
+    yield "bookkeeping for gradients with respect to h", "solve at a given kernel and stencils", *_gradient()
+    ready = js.factorize(poisson(), scattered(0), order=order)
+    yield "neighbours, rows and factors, when only data changed", "js.factorize against solve", seconds(
+        lambda k: ready.solve(poisson(1.0 + k)).u), whole
+    yield "the factorisation, when only a value on the boundary changed", "solve of the same cloud again", *_kept_factor()
+    yield "compiling for another cloud of similar size", "solve, 9,801 particles after 10,000", *_compiled_again()
+
+
+def both(without: Callable[[int], Any], with_it: Callable[[int], Any]) -> tuple[float, float]:
+    return seconds(without), seconds(with_it)
+
+
+def _for_each(order: int) -> Callable[[int], Any]:
+    """The local phase as if the operator's coefficients varied."""
+    disc = discretized(laplace(), scattered(0), "S", order)
+    nums = dz.numbers(disc, laplace())
+    nums.jac = np.broadcast_to(nums.jac, (*nums.jac.shape[:2], 1, len(nums.ids)))
+    nums.jac = np.concatenate([nums.jac, np.zeros((*nums.jac.shape[:2], count(2, disc.rec.degree) - 1, len(nums.ids)))], 2)
+    return lambda k: dz.all_rows(disc, nums)[1][0].weights
+
+
+def _unsourced(function: Callable) -> Callable:
+    return lambda scheme, *rest: function(replace(scheme, sourced=False), *rest)
+
+
+def _rows_of(method: str) -> Callable[[int], Any]:
+    cloud = scattered(0)
+    kernel = js.Gaussian(h=2.0 * SPACING, d=2.0)
+    disc = discretized(laplace(), cloud, method, 4, kernel)
+    nums = dz.numbers(disc, laplace())
+    return lambda k: dz.all_rows(disc, nums)[1][0].weights
+
+
+def _gradient() -> tuple[float, float]:
+    cloud = scattered(0)
+    kernel = js.Gaussian(h=2.0 * SPACING, d=2.0)
+    near = js.stencils(cloud, radius=4.4 * SPACING)
+    problem = poisson()
+
+    def mean(h: Any) -> Any:
+        return jnp.mean(js.solve(problem, cloud, kernel=js.Gaussian(h=h, d=2.0), stencils=near, order=4).u ** 2)
+
+    h = float(kernel.h)
+    return seconds(lambda k: mean(h * (1 + 1e-9 * k))), seconds(lambda k: jax.value_and_grad(mean)(h * (1 + 1e-9 * k)))
+
+
+def _kept_factor() -> tuple[float, float]:
+    cloud = scattered(0)
+
+    def solved(k: int, forget: bool) -> Any:
+        if forget:
+            linsolve.clear_cache()
+        return js.solve(poisson(1.0 + k), cloud, order=6).u
+
+    return seconds(lambda k: solved(k, False)), seconds(lambda k: solved(k, True))
+
+
+def _compiled_again() -> tuple[float, float]:
+    first = js.solve(poisson(), scattered(0), order=6).u
+    jax.block_until_ready(first)
+    took = []
+    for forget in (False, True):
+        if forget:
+            jax.clear_caches()
+        start = time.perf_counter()
+        jax.block_until_ready(js.solve(poisson(2.0), scattered(1, 99), order=6).u)
+        took.append(time.perf_counter() - start)
+    return took[0], took[1]
+
+
+def main() -> None:
+    jax.config.update("jax_enable_x64", True)
+    about, found = machine.describe(), []
+    for what, where, without, with_it in lines():
+        found.append([what, where, f"{1e3 * without:.3g}", f"{1e3 * with_it:.3g}", f"{with_it / without:.2g}"])
+        print(" | ".join(found[-1]), flush=True)
+    note = (
+        f"Milliseconds, medians of {REPEATS}, ten thousand particles, on {about['cores']} cores of {about['processor']} "
+        "(`python -m benchmarks.skipping`)."
+    )
+    made = {"columns": ["what is left out", "measured in", "without", "with", "ratio"], "rows": found, "note": note}
+    DATA.write_text(json.dumps({"machine": about, "tables": {"skipping": made}}, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    sys.exit(main())
