@@ -76,7 +76,8 @@ def test_bars_of_everything_else_that_can_be_long(monkeypatch):
     js.stencils(LINE, size=5)
     js.from_polygon([(0, 0), (1, 0), (0, 1)], 0.2)
     js.continuation(lambda c: js.Problem(lambda u, x: js.laplacian(u)(x) + c, ENDS), LINE, [1.0, 2.0])
-    assert {"factorize, local fits 27%", "neighbours", "cloud", "continuation: 50%|#####     | 1/2"} <= set(told(seen))
+    assert {"factorize, local fits 27%", "neighbours", "cloud"} <= set(told(seen))
+    assert any(line.startswith("continuation:") and "1/2" in line for line in told(seen))
 
 
 def test_a_search_shows_one_bar_and_none_of_its_solves(monkeypatch):
