@@ -189,11 +189,12 @@ def decades(axis: Any) -> None:
 
 def at_ends(ax: Any, ends: list[tuple[float, float, str, str]]) -> None:
     """Words (x, y, words, colour) to the right of the lines' ends, pushed apart where lines end together."""
-    lowest = -np.inf
-    for x, y, words, colour in sorted(ends, key=lambda end: end[1]):
-        height = ax.transData.transform((x, y))[1] * 72.0 / ax.figure.dpi
-        lowest = max(lowest + 11.0, height)
-        ax.annotate(words, (x, y), (7, lowest - height), textcoords="offset points", va="center", color=colour,
+    points = [ax.transData.transform((x, y))[1] * 72.0 / ax.figure.dpi for x, y, *_ in ends]
+    placed, last = dict[int, float](), -np.inf
+    for k in np.argsort(points, kind="stable"):
+        placed[k] = last = max(points[k], last + 11.0)
+    for k, (x, y, words, colour) in enumerate(ends):
+        ax.annotate(words, (x, y), (7, placed[k] - points[k]), textcoords="offset points", va="center", color=colour,
                     annotation_clip=False)  # fmt: skip
 
 
