@@ -68,6 +68,7 @@ def dress(ax: Any, dim: int) -> None:
     labels(ax, *_NAMES[:2])
     if dim == 3:
         ax.set_zlabel("z")
+        ax.locator_params(nbins=5)  # more would run into one another in perspective
 
 
 def labels(ax: Any, x: str, y: str) -> None:
@@ -139,13 +140,15 @@ def draw_normals(ax: Any, cloud: Cloud, place: np.ndarray) -> None:
     if cloud.dim == 3:
         ax.quiver(*place[rim].T, *arrows.T, color="0.3", linewidth=0.6)
     else:
-        ax.quiver(*place[rim].T, *arrows.T, angles="xy", scale_units="xy", scale=1, color="0.3", width=0.003, zorder=1)
+        ax.quiver(*place[rim].T, *arrows.T, angles="xy", scale_units="xy", scale=1, color="0.3", units="inches",
+                  width=0.012, zorder=1)  # fmt: skip
         ax.update_datalim(place[rim] + arrows)
         ax.autoscale_view()
 
 
-def draw_support(ax: Any, cloud: Cloud, place: np.ndarray, particle: int, kernel: Any, found: Any) -> None:
-    """One particle, its neighbours ringed, and the ball of its kernel."""
+def draw_support(ax: Any, cloud: Cloud, place: np.ndarray, particle: int, kernel: Any, found: Any,
+                 size: float) -> None:  # fmt: skip
+    """One particle, its neighbours ringed, and the ball of its kernel; ``size`` is that of the dots."""
     if not 0 <= particle < len(cloud):
         raise ValueError(f"support: particle {particle}, but the cloud has particles 0 to {len(cloud) - 1}")
     if kernel is None and found is None:
@@ -157,9 +160,10 @@ def draw_support(ax: Any, cloud: Cloud, place: np.ndarray, particle: int, kernel
     else:
         row = neighbours(found)[particle]
     row = row[row >= 0]
-    ring = {"facecolors": "none", "edgecolors": "k", "linewidths": 0.9, "s": 60, "zorder": 4}
+    ring = {"facecolors": "none", "edgecolors": "k", "linewidths": 0.9, "s": np.clip(3 * size, 15, 60), "zorder": 4}
     ax.scatter(*place[row].T, label=f"support of {particle} ({len(row)})", **ring)
-    ax.scatter(*place[particle : particle + 1].T, c="k", marker="*", s=110, zorder=5, linewidths=0)
+    star = {"c": "k", "marker": "*", "s": np.clip(6 * size, 45, 110), "zorder": 5, "linewidths": 0}
+    ax.scatter(*place[particle : particle + 1].T, **star)
     if radius is None:
         return
     if cloud.dim == 1:
@@ -167,11 +171,31 @@ def draw_support(ax: Any, cloud: Cloud, place: np.ndarray, particle: int, kernel
     elif cloud.dim == 2:
         from matplotlib.patches import Circle
 
-        ax.add_patch(Circle(place[particle], radius, facecolor=COLOURS[5], alpha=0.2, edgecolor="none", zorder=0))
+        ax.add_patch(Circle(place[particle], radius, facecolor=COLOURS[5], alpha=0.35, edgecolor="none", zorder=0))
     else:
         u, v = np.mgrid[0 : 2 * np.pi : 25j, 0 : np.pi : 13j]  # type: ignore[misc]
         sphere = radius * np.stack([np.cos(u) * np.sin(v), np.sin(u) * np.sin(v), np.cos(v)])
         ax.plot_wireframe(*(sphere + place[particle][:, None, None]), color=COLOURS[5], linewidth=0.4)
+
+
+def decades(axis: Any) -> None:
+    """Ticks at 1, 2 and 5 of every power of ten, in plain numbers where there are few powers."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def at_ends(ax: Any, ends: list[tuple[float, float, str, str]]) -> None:
+    """Words (x, y, words, colour) to the right of the lines' ends, pushed apart where lines end together."""
+    points = [ax.transData.transform((x, y))[1] * 72.0 / ax.figure.dpi for x, y, *_ in ends]
+    placed, last = dict[int, float](), -np.inf
+    for k in np.argsort(points, kind="stable"):
+        placed[k] = last = max(points[k], last + 11.0)
+    for k, (x, y, words, colour) in enumerate(ends):
+        ax.annotate(words, (x, y), (7, placed[k] - points[k]), textcoords="offset points", va="center", color=colour,
+                    annotation_clip=False)  # fmt: skip
 
 
 def maps(cloud: Cloud, numbers: np.ndarray, anywhere: Callable | None, at: Mapping[str, float] | None, levels: int,
@@ -217,7 +241,7 @@ def maps(cloud: Cloud, numbers: np.ndarray, anywhere: Callable | None, at: Mappi
 def page(points: np.ndarray) -> tuple[float, float]:
     """A figure's size for a domain: its shape, within limits, and a colour bar or legend."""
     if points.shape[1] != 2:
-        return (5.6, 1.6) if points.shape[1] == 1 else (6.0, 5.0)
+        return (5.6, 1.6) if points.shape[1] == 1 else (7.6, 5.0)
     width, height = np.ptp(points, axis=0)
     ratio = float(np.clip(height / width, 0.3, 2.2))
     wide = 4.6 if ratio < 1 else 4.6 / ratio

@@ -16,12 +16,14 @@ from jsmitsm.discretize import Discretization, Numbers
 from jsmitsm.kernels import Kernel
 from jsmitsm.neighbours import Stencils
 from jsmitsm.problem import Problem
+from jsmitsm.progress import bar
 from jsmitsm.solution import Recipe, Solution
 from jsmitsm.solve import Fit, discretized
 from jsmitsm.system import Run
 from jsmitsm.taylor import multi_indices
 
 
+@bar("error estimate")
 def error_estimate(solution: Solution) -> Any:
     """Estimated error |u - u_exact| of every particle, (N,) or (N, F).
 
@@ -130,6 +132,7 @@ class Factorization:
         self._classes, self._rows = self._run.local_rows(self._nums)
         self._matrix = dz.matrix(disc, self._classes, self._rows)
 
+    @bar("solve")
     def solve(self, problem: Problem) -> Solution:
         """The solution of a problem with the same operator: (source and boundary values may differ)."""
         old = self._disc
@@ -167,6 +170,7 @@ def _same(x: Any, y: Any) -> bool:
     return np.shape(x) == np.shape(y) and bool(np.array_equal(np.asarray(x), np.asarray(y)))
 
 
+@bar("factorize")
 def factorize(
     problem: Problem, cloud: Cloud, *, method: str = "S", order: int = 4, kernel: Kernel | None = None,
     stencils: Stencils | None = None, solver: str = "auto",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import jax.numpy as jnp
@@ -13,8 +14,9 @@ from jsmitsm.layout import Class, Discretization, sorted_classes, table
 from jsmitsm.moments import Row
 from jsmitsm.neighbours import Stencils
 from jsmitsm.numbers import Numbers
+from jsmitsm.progress import each
 from jsmitsm.recursion import Recursion
-from jsmitsm.rows import operands, right_sides, shared_elimination
+from jsmitsm.rows import operands, pieces, right_sides, shared_elimination
 
 
 def matrix(disc: Discretization, classes: list[Class], rows: list[Row]) -> tuple[Any, Any, Any]:
@@ -49,7 +51,7 @@ def matrix(disc: Discretization, classes: list[Class], rows: list[Row]) -> tuple
     return _joined(parts)
 
 
-def _joined(parts: list[tuple[Any, Any, Any]]) -> tuple[Any, Any, Any]:
+def _joined(parts: Sequence[tuple[Any, Any, Any]]) -> tuple[Any, Any, Any]:
     """Entries and their places, each in one array; places stay on the host where they can."""
     values, at, to = zip(*parts)
     join = jnp.concatenate if is_traced(values) else np.concatenate
@@ -98,44 +100,49 @@ def least_squares(disc: Discretization, nums: Numbers, fits: list[Any] | None = 
     projector of a fit is idempotent, so nothing is squared.
     """
     shared = shared_elimination(disc, nums)
-    unknown, held = disc.unknowns, nums.held
-    n = int(unknown.max(initial=-1)) + 1
-    parts: list[Any] = []
-    b: Any = np.zeros(n)
-    for cls in sorted_classes(disc, nums.ids, Stencils(table(disc), None)):
-        given = operands(disc, nums, cls.ids, cls.scheme, shared)
-        made = assembly.blocks(
-            cls.scheme, disc.points, disc.kernel, cls.ids, cls.neighbours, given, right_sides(disc, nums, cls)
-        )
-        near = disc.images.owners(cls.neighbours)
-        xp = jnp if is_traced(near, made, held, nums.gamma) else np
-        index = xp.maximum(near, 0)
-        place = xp.where((near >= 0)[..., None], xp.asarray(unknown)[index], -1).reshape(len(cls.ids), -1)
-        known = xp.where((near >= 0)[..., None], xp.asarray(held)[index], 0.0).reshape(len(cls.ids), -1)
-        known = xp.where(place >= 0, 0.0, known)
-        extra = xp.asarray(nums.gamma)[index].reshape(len(cls.ids), -1)
-        given_data = xp.concatenate([known, extra], axis=1)
-        m = place.shape[1]
-        matrix, load = xp.asarray(made.matrix), xp.asarray(made.load)
-        if fits is not None and xp is np:
-            own = slice(0, disc.rec.fields)
-            fits.append((near, matrix[:, own].copy(), load[:, own].copy(), extra))
-        right = (load - xp.einsum("nij,nj->ni", matrix, given_data))[:, :m]
-        r = xp.broadcast_to(place[:, :, None], (len(cls.ids), m, m))
-        c = xp.broadcast_to(place[:, None, :], (len(cls.ids), m, m))
-        keep = (r >= 0) & (c >= 0)
-        if xp is np:
+    n = int(disc.unknowns.max(initial=-1)) + 1
+    whole = sorted_classes(disc, nums.ids, Stencils(table(disc), None))
+    classes = [piece for cls in whole for piece in pieces(disc, nums, cls)]
+    parts, loads = zip(*each("local fits", lambda cls: _normal_part(disc, nums, cls, shared, fits), classes))
+    if is_traced(loads):
+        b: Any = jnp.zeros(n)
+        for place, right in loads:
+            b = b.at[jnp.maximum(place, 0)].add(jnp.where(place >= 0, right, 0.0))
+    else:
+        b = np.zeros(n)
+        for place, right in loads:
             np.add.at(b, place[place >= 0], right[place >= 0])
-            parts.append((matrix[:, :m, :m][keep], r[keep], c[keep]))
-        else:
-            b = jnp.asarray(b).at[jnp.maximum(place, 0)].add(jnp.where(place >= 0, right, 0.0))
-            if is_traced(near):
-                flat = (jnp.where(keep, matrix[:, :m, :m], 0.0), jnp.where(keep, r, 0), jnp.where(keep, c, 0))
-                parts.append(tuple(x.reshape(-1) for x in flat))
-            else:
-                at = np.nonzero(np.asarray(keep))
-                parts.append((matrix[:, :m, :m][at], np.asarray(r)[at], np.asarray(c)[at]))
     return *_joined(parts), b
+
+
+def _normal_part(disc: Discretization, nums: Numbers, cls: Class, shared: Any, fits: list[Any] | None) -> tuple:
+    """What one class adds to the normal equations: entries as coordinates, and places and values on the right."""
+    given = operands(disc, nums, cls.ids, cls.scheme, shared)
+    made = assembly.blocks(
+        cls.scheme, disc.points, disc.kernel, cls.ids, cls.neighbours, given, right_sides(disc, nums, cls)
+    )
+    near = disc.images.owners(cls.neighbours)
+    xp = jnp if is_traced(near, made, nums.held, nums.gamma) else np
+    index = xp.maximum(near, 0)
+    place = xp.where((near >= 0)[..., None], xp.asarray(disc.unknowns)[index], -1).reshape(len(cls.ids), -1)
+    known = xp.where((near >= 0)[..., None], xp.asarray(nums.held)[index], 0.0).reshape(len(cls.ids), -1)
+    known = xp.where(place >= 0, 0.0, known)
+    extra = xp.asarray(nums.gamma)[index].reshape(len(cls.ids), -1)
+    m = place.shape[1]
+    matrix, load = xp.asarray(made.matrix), xp.asarray(made.load)
+    if fits is not None and xp is np:
+        own = slice(0, disc.rec.fields)
+        fits.append((near, matrix[:, own].copy(), load[:, own].copy(), extra))
+    right = (load - xp.einsum("nij,nj->ni", matrix, xp.concatenate([known, extra], axis=1)))[:, :m]
+    r = xp.broadcast_to(place[:, :, None], (len(cls.ids), m, m))
+    c = xp.broadcast_to(place[:, None, :], (len(cls.ids), m, m))
+    keep = (r >= 0) & (c >= 0)
+    matrix = matrix[:, :m, :m]
+    if is_traced(near):
+        entries = (jnp.where(keep, matrix, 0.0), jnp.where(keep, r, 0), jnp.where(keep, c, 0))
+        return tuple(x.reshape(-1) for x in entries), (place, right)
+    at = np.nonzero(np.asarray(keep))
+    return (matrix[at], np.asarray(r)[at], np.asarray(c)[at]), (place, right)
 
 
 def prefers_least_squares(disc: Discretization, nums: Numbers) -> bool:

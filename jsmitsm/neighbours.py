@@ -10,6 +10,7 @@ import numpy as np
 
 from jsmitsm.clouds import Cloud
 from jsmitsm.kernels import EDGE
+from jsmitsm.progress import bar
 from jsmitsm.threads import cores
 
 # Neighbours at the same distance up to this enter together: rounding must not choose among them.
@@ -50,6 +51,7 @@ class Stencils:
         return f"Stencils({len(self)} particles, at most {self.width} neighbours each, themselves counted)"
 
 
+@bar("neighbours")
 def stencils(cloud: Cloud, *, size: int | None = None, radius: Any = None) -> Stencils:
     """Find every particle's neighbours, once, on the host.
 

@@ -79,7 +79,7 @@ def _iterate(
         rate = next_length / length if part == 1.0 else rate
         values, taylor, target, length = values_new, taylor_new, next_target, next_length
         steps += 1
-        shown.set_postfix_str(f"change {length:.1e}", refresh=False)
+        shown.note(f"change {length:.1e}")
         shown.update()
     relative = length / _size(target[0])
     good = bool(relative <= 1e-8)

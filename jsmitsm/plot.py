@@ -68,10 +68,10 @@ def cloud(what: Any, *, normals: bool = False, support: int | None = None, kerne
         drawing.draw_normals(ax, shown, place)
     if support is not None:
         found = what if stencils is None and isinstance(what, Solution) else stencils
-        drawing.draw_support(ax, shown, place, support, kernel, found)
+        drawing.draw_support(ax, shown, place, support, kernel, found, size)
     drawing.dress(ax, shown.dim)
     if legend:
-        outside = {} if shown.dim == 3 else {"bbox_to_anchor": (1.02, 1.0), "borderaxespad": 0.0}
+        outside = {"bbox_to_anchor": (1.08 if shown.dim == 3 else 1.02, 1.0), "borderaxespad": 0.0}
         handles = ax.legend(loc="upper left", frameon=False, fontsize="small", **outside).legend_handles
         for handle in handles:
             handle.set_sizes([30])
@@ -201,17 +201,20 @@ def sparsity(what: Any, *, ax: Any = None) -> Any:
         index = drawing.neighbours(what)
         rows, columns = np.nonzero(index >= 0)
         columns, shape = index[rows, columns], (len(index), len(index))
+        names = ("neighbour", "particle")
     else:
         from scipy.sparse import coo_matrix
 
         matrix = coo_matrix(what)
         rows, columns, shape = matrix.row, matrix.col, matrix.shape
+        names = ("column", "row")
     ax = drawing.axes(ax, 2)
     # More rows than a screen has pixels: one pixel stands for a block, the darker the fuller.
     bins = [-(-n // -(-n // 600)) for n in shape]
     picture = np.histogram2d(rows, columns, bins=bins, range=[(-0.5, n - 0.5) for n in shape])[0]
     extent = (-0.5, shape[1] - 0.5, shape[0] - 0.5, -0.5)
     ax.imshow(picture ** 0.5, cmap="Greys", vmin=0, extent=extent, interpolation="nearest")
+    ax.set(xlabel=names[0], ylabel=names[1])
     ax.set_title(f"{shape[0]} rows, {len(rows)} entries, {len(rows) / shape[0]:.1f} a row", fontsize="medium")
     return ax
 
@@ -249,6 +252,9 @@ def tuning(result: Any, *, ax: Any = None) -> Any:
             best = int(np.nanargmin(track))
             one.plot(best, track[best], "o", color="k", markersize=7, fillstyle="none")
             one.set_title(f"best {track[best]:.3g} at step {best}", loc="right", fontsize="small")
+        else:
+            one.ticklabel_format(axis="y", useOffset=False)
+        one.xaxis.get_major_locator().set_params(integer=True)
         drawing.labels(one, "step" if k == len(panels) - 1 else "", name)
     return axes
 
@@ -274,6 +280,7 @@ def convergence(spacing: Any, errors: Any, *, floor: float = 1e-13, xlabel: str 
     spacing = np.asarray(spacing, dtype=float)
     lines = errors if isinstance(errors, Mapping) else {"": errors}
     ax = drawing.axes(ax, 1)
+    ends = []
     for k, (name, values_) in enumerate(lines.items()):
         y = np.asarray(values_, dtype=float)
         if y.shape != spacing.shape or y.ndim != 1 or len(y) < 2 or not (y > 0).all() or not (spacing > 0).all():
@@ -286,11 +293,11 @@ def convergence(spacing: Any, errors: Any, *, floor: float = 1e-13, xlabel: str 
         fit = y > floor
         if fit.sum() >= 2 and np.ptp(np.log(spacing[fit])) > 0:
             slope = np.polyfit(np.log(spacing[fit]), np.log(y[fit]), 1)[0]
-            last = order[-1]
-            ax.annotate(f"order {slope:.2f}", (spacing[last], y[last]), (7, 0), textcoords="offset points",
-                        va="center", color=colour, annotation_clip=False)  # fmt: skip
+            ends.append((spacing[order[-1]], y[order[-1]], f"order {slope:.2f}", colour))
     ax.set(xscale="log", yscale="log")
     ax.margins(x=0.12)
+    drawing.decades(ax.xaxis)
+    drawing.at_ends(ax, ends)
     if any(lines):
         ax.legend(frameon=False, fontsize="small")
     drawing.labels(ax, xlabel, ylabel)

@@ -3,39 +3,108 @@
 Shown after the first seconds, on a terminal or in a notebook, if tqdm is installed; never in
 pipes or under pytest. Off for a block with :func:`no_progress`, for a process with the
 environment variable ``TQDM_DISABLE=1``.
+
+There is one bar at a time: what opens a bar inside of another's becomes a stage that the outer one
+names, "solve, local fits 40%". A clock ticks beside it, also while one long call (a factorisation,
+a compilation) reports nothing.
 """
 
 from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Iterator
+import threading
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import replace
 from typing import Any
 
-import jax
-import jax.numpy as jnp
-import numpy as np
-
-from jsmitsm.boundary import is_traced
-
-# Seconds before a bar appears: what is done by then needs none.
-DELAY = 1.5
-# At most so many particles between two movements of the bar.
-PIECE = 8192
-
-# Also set while a bar is shown, so that a solve inside a search opens no second one.
-_silent: ContextVar[bool] = ContextVar("silent", default=False)
+# Seconds before a bar appears: what is done by then needs none. Then between two ticks of its clock,
+# and the shortest time between two movements.
+DELAY, TICK, PAUSE = 1.5, 0.5, 0.1
 
 
-class _NoBar:
+class _Nothing:
     """Stands in where no bar is wanted."""
 
     def update(self, n: int = 1) -> None: ...
 
-    def set_postfix_str(self, text: str, refresh: bool = True) -> None: ...
+    def note(self, text: str) -> None: ...
+
+    def stage(self, what: str, total: int | None) -> _Nothing:
+        return self
+
+    def close(self) -> None: ...
+
+
+class _Bar:
+    """A tqdm bar with a clock that ticks by itself."""
+
+    def __init__(self, what: str, total: int | None):
+        tqdm = _bars()
+        form = None if total else "{desc} [{elapsed}{postfix}]"
+        self.what, self.total = what, total
+        self._bar = tqdm(total=total, desc=what, delay=DELAY, mininterval=PAUSE, miniters=0, leave=False,
+                         bar_format=form)  # fmt: skip
+        self._lock, self._done = threading.Lock(), threading.Event()
+        self._clock = threading.Thread(target=self._tick, daemon=True)
+        self._clock.start()
+
+    def _tick(self) -> None:
+        while not self._done.wait(TICK):
+            self.update(0)
+
+    def update(self, n: int = 1) -> None:
+        with self._lock:
+            self._bar.update(n)
+
+    def note(self, text: str) -> None:
+        """A few words or numbers at the end of the bar."""
+        with self._lock:
+            self._bar.set_postfix_str(text, refresh=False)
+
+    def say(self, text: str) -> None:
+        with self._lock:
+            self._bar.set_description_str(f"{self.what}, {text}" if text else self.what, refresh=False)
+            self._bar.update(0)
+
+    def stage(self, what: str, total: int | None) -> _Stage | _Nothing:
+        # A bar that fills up tells enough.
+        return _NOTHING if self.total else _Stage(self, what, total)
+
+    def close(self) -> None:
+        self._done.set()
+        self._clock.join()
+        self._bar.close()
+
+
+class _Stage:
+    """What goes on inside of a bar, in its words."""
+
+    def __init__(self, outer: Any, what: str, total: int | None):
+        self.outer, self.what, self.total, self.done = outer, what, total, 0
+        self.say("")
+
+    def update(self, n: int = 1) -> None:
+        self.done += n
+        self.say("")
+
+    def note(self, text: str) -> None: ...
+
+    def say(self, text: str) -> None:
+        at = f" {self.done / self.total:.0%}" if self.total else f" {self.done}" if self.done else ""
+        self.outer.say(self.what + at + (f", {text}" if text else ""))
+
+    def stage(self, what: str, total: int | None) -> _Stage:
+        return _Stage(self, what, total)
+
+    def close(self) -> None:
+        self.outer.say("")
+
+
+_NOTHING = _Nothing()
+# What is shown now; None where nothing long has begun.
+_shown: ContextVar[Any] = ContextVar("shown", default=None)
 
 
 @contextmanager
@@ -48,60 +117,63 @@ def no_progress() -> Iterator[None]:
     >>> with js.no_progress():
     ...     pass  # js.solve(...), js.tune(...)
     """
-    token = _silent.set(True)
+    token = _shown.set(_NOTHING)
     try:
         yield
     finally:
-        _silent.reset(token)
+        _shown.reset(token)
 
 
 @contextmanager
 def bar(what: str, total: int | None = None, wanted: bool = True) -> Iterator[Any]:
-    """A bar, or what looks like one; no other opens inside."""
-    made = _opened(what, total) if wanted else None
-    with no_progress():
-        try:
-            yield _NoBar() if made is None else made
-        finally:
-            if made is not None:
-                made.close()
+    """A bar, a stage of the one that is shown, or nothing that looks like one.
 
-
-def _opened(what: str, total: int | None) -> Any:
-    if not watched():
-        return None
-    from tqdm import tqdm
-
-    return tqdm(total=total, desc=what, delay=DELAY, leave=False)
+    It has ``update(n)`` and ``note(text)``. Also a decorator: ``@bar("what the function does")``.
+    """
+    outer = _shown.get()
+    if not wanted or (outer is None and not watched()):
+        made: Any = _NOTHING
+    else:
+        made = _Bar(what, total) if outer is None else outer.stage(what, total)
+    token = _shown.set(made)
+    try:
+        yield made
+    finally:
+        _shown.reset(token)
+        made.close()
 
 
 def watched() -> bool:
     """Whether a bar would be seen."""
-    if _silent.get() or "PYTEST_CURRENT_TEST" in os.environ or os.environ.get("TQDM_DISABLE", "0") != "0":
+    if "PYTEST_CURRENT_TEST" in os.environ or os.environ.get("TQDM_DISABLE", "0") != "0":
         return False
     # A notebook's stderr says that it is no terminal.
-    if not (sys.stderr.isatty() or type(sys.stderr).__module__.startswith("ipykernel")):
-        return False
+    return (sys.stderr.isatty() or _in_notebook()) and _bars() is not None
+
+
+def _in_notebook() -> bool:
+    return type(sys.stderr).__module__.startswith("ipykernel")
+
+
+def _bars() -> Any:
+    """tqdm's class of text bars, or None where it is not installed."""
     try:
-        import tqdm  # noqa: F401
+        from tqdm import tqdm
     except ImportError:
-        return False
-    return True
+        return None
+    return tqdm
 
 
-def in_pieces(what: str, one: Callable[[Any], Any], cls: Any, *context: Any) -> Any:
-    """``one(cls)`` for a class of particles: at once, or piece by piece with a bar where one is watched.
+def shown() -> bool:
+    """Whether a bar is there now that would tell of stages."""
+    return isinstance(_shown.get(), (_Bar, _Stage))
 
-    The results are pytrees with the particle axis first; nothing is cut up where ``context`` is traced.
-    """
-    n = len(cls.ids)
-    if n <= 2 * PIECE or not watched() or is_traced(context, cls.neighbours, jnp.asarray(np.zeros(()))):
-        return one(cls)
+
+def each(what: str, one: Callable[[Any], Any], classes: Sequence[Any]) -> list[Any]:
+    """``one`` of every class, under a bar that counts their particles."""
     made = []
-    step = -(-n // -(-n // PIECE))  # pieces of one size: one program serves all
-    with bar(what, n) as shown:
-        for start in range(0, n, step):
-            some = slice(start, start + step)
-            made.append(one(replace(cls, ids=cls.ids[some], neighbours=cls.neighbours[some])))
-            shown.update(len(cls.ids[some]))
-    return jax.tree.map(lambda *x: np.concatenate(x), *made)
+    with bar(what, sum(len(cls.ids) for cls in classes)) as shown:
+        for cls in classes:
+            made.append(one(cls))
+            shown.update(len(cls.ids))
+    return made

@@ -18,8 +18,11 @@ from jsmitsm.layout import Class, Discretization
 from jsmitsm.moments import Elimination, Row, Scheme
 from jsmitsm.neighbours import nearest, within
 from jsmitsm.numbers import Numbers
-from jsmitsm.progress import in_pieces
+from jsmitsm.progress import each, shown
 from jsmitsm.repeats import repeats
+
+# Where a progress bar is shown, at most so many particles between two of its movements.
+PIECE = 8192
 
 
 def operands(disc: Discretization, nums: Numbers, ids: np.ndarray, scheme: Scheme, shared: Any) -> Operands:
@@ -144,6 +147,24 @@ def _recovery_kernel(disc: Discretization) -> tuple[Kernel, Any]:
     return wide, within(np.asarray(points), wide.h * np.asarray(kernel.d)).indices if near is None else near
 
 
+def pieces(disc: Discretization, nums: Numbers, cls: Class, *more: Any) -> list[Class]:
+    """A large class in pieces of one size (one program serves all), for a bar to move; in one where none is shown."""
+    n = len(cls.ids)
+    if n <= 2 * PIECE or not shown():
+        return [cls]
+    # The last one tells whether everything is traced here, as under jit.
+    if is_traced(disc.points, disc.kernel, vars(nums), cls.neighbours, more, jnp.asarray(np.zeros(()))):
+        return [cls]
+    step = -(-n // -(-n // PIECE))
+    cuts = [slice(start, start + step) for start in range(0, n, step)]
+    return [replace(cls, ids=cls.ids[some], neighbours=cls.neighbours[some]) for some in cuts]
+
+
+def _joined(parts: list[Any]) -> Any:
+    """Pytrees with the particle axis first, one after another."""
+    return parts[0] if len(parts) == 1 else jax.tree.map(lambda *x: np.concatenate(x), *parts)
+
+
 def class_rows(disc: Discretization, nums: Numbers, cls: Class, shared: Any) -> Row:
     """The rows of one class of particles."""
 
@@ -151,23 +172,20 @@ def class_rows(disc: Discretization, nums: Numbers, cls: Class, shared: Any) -> 
         given = operands(disc, nums, cls.ids, cls.scheme, shared)
         return assembly.rows(cls.scheme, disc.points, disc.kernel, cls.ids, cls.neighbours, given)
 
-    return in_pieces("local fits", one, cls, disc.points, disc.kernel, vars(nums))
+    return _joined(each("local fits", one, pieces(disc, nums, cls)))
 
 
 def class_coefficients(disc: Discretization, nums: Numbers, cls: Class, shared: Any, u: Any) -> Any:
     """Taylor coefficients (n, F, K) of one class of particles from all values u (N, F)."""
-    given = operands(disc, nums, cls.ids, cls.scheme, shared)
-    source, values = right_sides(disc, nums, cls)
-    return assembly.coefficients(
-        cls.scheme,
-        disc.points,
-        disc.kernel,
-        cls.ids,
-        cls.neighbours,
-        given,
-        (source, values),
-        (disc.images.extend_values(u), disc.images.extend_values(nums.gamma)),
-    )
+    whole = (disc.images.extend_values(u), disc.images.extend_values(nums.gamma))
+
+    def one(cls: Class) -> Any:
+        given = operands(disc, nums, cls.ids, cls.scheme, shared)
+        return assembly.coefficients(
+            cls.scheme, disc.points, disc.kernel, cls.ids, cls.neighbours, given, right_sides(disc, nums, cls), whole
+        )
+
+    return _joined(each("Taylor coefficients", one, pieces(disc, nums, cls, u)))
 
 
 def right_sides(disc: Discretization, nums: Numbers, cls: Class) -> tuple[Any, Any]:

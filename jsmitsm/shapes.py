@@ -12,10 +12,12 @@ from jsmitsm.clouds import INTERIOR, Cloud
 from jsmitsm.evenness import Quality as Quality
 from jsmitsm.evenness import quality as quality
 from jsmitsm.packing import Spacing
+from jsmitsm.progress import bar
 
 Predicate = Callable[[np.ndarray], Any]
 
 
+@bar("cloud")
 def from_sdf(
     sdf: Callable,
     bounds: tuple[Any, Any],
@@ -72,6 +74,7 @@ def from_sdf(
     return _cloud(region, rule, lo, hi, boundary, named, seed, not callable(spacing))
 
 
+@bar("cloud")
 def from_polygon(
     vertices: Any,
     spacing: Any,

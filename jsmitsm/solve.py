@@ -17,6 +17,7 @@ from jsmitsm.linsolve import SOLVERS
 from jsmitsm.neighbours import Stencils
 from jsmitsm.newton import newton
 from jsmitsm.problem import Problem
+from jsmitsm.progress import bar
 from jsmitsm.solution import Recipe, Solution
 from jsmitsm.system import Run
 
@@ -40,6 +41,7 @@ class Fit:
         r = self.recipe
         return dz.discretize(self.problem, self.cloud, r.method, r.order, self.kernel, near, r.basis_terms)
 
+    @bar("fitting")
     def coefficients(self, values: Any) -> Any:
         """Taylor coefficients (N, F, K) of every particle."""
         disc = self.discretization()
@@ -57,6 +59,7 @@ class Fit:
         return cls(*leaves, recipe)
 
 
+@bar("solve")
 def solve(
     problem: Problem,
     cloud: Cloud,

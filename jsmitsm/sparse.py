@@ -20,6 +20,7 @@ import numpy as np
 from jsmitsm.backends import BACKENDS, ITERATIVE, SuperLU, installed
 from jsmitsm.errors import SolveError
 from jsmitsm.ordering import nested_dissection
+from jsmitsm.progress import bar
 from jsmitsm.threads import cores
 
 # Unknowns up to which LAPACK beats the sparse codes. From 200 on it would use several threads, which
@@ -249,7 +250,8 @@ class Factor:
         backend = self._backends[0]
         COUNTS["factorisations"] += 1
         try:
-            self._lu = BACKENDS[backend](self.matrix)
+            with bar(f"{backend} on {self.n} unknowns"):
+                self._lu = BACKENDS[backend](self.matrix)
         except (RuntimeError, ValueError, np.linalg.LinAlgError) as error:
             if self._give_way(f"failed ({error})"):
                 return

@@ -454,7 +454,7 @@ class _Search:
             z, point, part = new, trial, min(1.0, 1.5 * part)
             if self._accept(point):
                 last = step
-            shown.set_postfix_str(f"objective {self.best.objective:.3g}", refresh=False)
+            shown.note(f"objective {self.best.objective:.3g}")
             if step - last >= PATIENCE:
                 break
         self._tell_retreats()

@@ -159,6 +159,12 @@ def test_tuning_history():
     assert len(plot.tuning(steps)) == 2
 
 
+def test_orders_of_lines_that_end_together_do_not_overlap():
+    h = np.array([0.1, 0.05])
+    first, second = plot.convergence(h, {"one": h**2, "other": 1.001 * h**2}).texts
+    assert second.xyann[1] - first.xyann[1] > 10, "a line of text is about ten points high"
+
+
 def test_observed_order_is_written_and_round_off_ignored():
     h = np.array([0.025, 0.1, 0.05, 0.0125])
     ax = plot.convergence(h, {"good": 3 * h**4, "flat": np.where(h < 0.02, 5e-14, h**6)})
