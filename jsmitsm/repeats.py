@@ -61,10 +61,10 @@ def _codes(points: np.ndarray, ids: np.ndarray, neighbours: np.ndarray, own: np.
     offsets = _offsets(points, ids, neighbours)
     distance = np.maximum.reduce([np.abs(x) for x in offsets])
     unit = _UNIT * distance[distance > 0].min()
-    factors = np.random.default_rng(0).integers(1 << 62, size=points.shape[1]) | 1
+    factors = np.random.default_rng(0).integers(1 << 62, size=(points.shape[1],))
     with np.errstate(over="ignore"):
         # Products wrap around: a hash of the offset.
-        code = sum(np.rint(x * (1.0 / unit)).astype(np.int64) * f for x, f in zip(offsets, factors))
+        code = np.sum([np.rint(x * (1.0 / unit)).astype(np.int64) * f for x, f in zip(offsets, factors)], axis=0)
         code = np.where(neighbours >= 0, code, np.iinfo(np.int64).max)
         code[:, 0] = np.iinfo(np.int64).min
         order = np.argsort(code, axis=1)  # equal codes are those of empty places

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import jax
@@ -20,9 +21,10 @@ from jsmitsm.neighbours import nearest, within
 from jsmitsm.numbers import Numbers
 from jsmitsm.progress import each, shown
 from jsmitsm.repeats import repeats
+from jsmitsm.threads import cores, side_by_side
 
-# Where a progress bar is shown, at most so many particles between two of its movements.
-PIECE = 8192
+# Particles that the cores share in pieces, between whose ends a progress bar moves; every piece costs a millisecond.
+PIECE, MOST_PIECES = 4096, 32
 
 
 def operands(disc: Discretization, nums: Numbers, ids: np.ndarray, scheme: Scheme, shared: Any) -> Operands:
@@ -148,16 +150,22 @@ def _recovery_kernel(disc: Discretization) -> tuple[Kernel, Any]:
 
 
 def pieces(disc: Discretization, nums: Numbers, cls: Class, *more: Any) -> list[Class]:
-    """A large class in pieces of one size (one program serves all), for a bar to move; in one where none is shown."""
+    """A large class in pieces of one size (one program serves all), for the cores to share or a bar to move."""
     n = len(cls.ids)
-    if n <= 2 * PIECE or not shown():
+    if n <= 2 * PIECE or not (shown() or cores() > 1):
         return [cls]
     # The last one tells whether everything is traced here, as under jit.
     if is_traced(disc.points, disc.kernel, vars(nums), cls.neighbours, more, jnp.asarray(np.zeros(()))):
         return [cls]
-    step = -(-n // -(-n // PIECE))
+    step = -(-n // min(-(-n // PIECE), MOST_PIECES))
     cuts = [slice(start, start + step) for start in range(0, n, step)]
     return [replace(cls, ids=cls.ids[some], neighbours=cls.neighbours[some]) for some in cuts]
+
+
+def _shared_out(what: str, disc: Discretization, cls: Class) -> Any:
+    """Like map, on all cores: for the pieces of a class."""
+    sizes = assembly.padded_size(len(disc.points)), len(cls.ids) // PIECE, cls.neighbours.shape[1]
+    return partial(side_by_side, program=(what, cls.scheme, sizes, disc.kernel is None))
 
 
 def _joined(parts: list[Any]) -> Any:
@@ -172,7 +180,7 @@ def class_rows(disc: Discretization, nums: Numbers, cls: Class, shared: Any) -> 
         given = operands(disc, nums, cls.ids, cls.scheme, shared)
         return assembly.rows(cls.scheme, disc.points, disc.kernel, cls.ids, cls.neighbours, given)
 
-    return _joined(each("local fits", one, pieces(disc, nums, cls)))
+    return _joined(each("local fits", one, pieces(disc, nums, cls), _shared_out("rows", disc, cls)))
 
 
 def class_coefficients(disc: Discretization, nums: Numbers, cls: Class, shared: Any, u: Any) -> Any:
@@ -185,7 +193,8 @@ def class_coefficients(disc: Discretization, nums: Numbers, cls: Class, shared: 
             cls.scheme, disc.points, disc.kernel, cls.ids, cls.neighbours, given, right_sides(disc, nums, cls), whole
         )
 
-    return _joined(each("Taylor coefficients", one, pieces(disc, nums, cls, u)))
+    cut = pieces(disc, nums, cls, u)
+    return _joined(each("Taylor coefficients", one, cut, _shared_out("coefficients", disc, cls)))
 
 
 def right_sides(disc: Discretization, nums: Numbers, cls: Class) -> tuple[Any, Any]:
