@@ -25,12 +25,15 @@ from jsmitsm.recursion import row_levels
 _BLOCK = 64
 # So few particles are always padded to as many.
 _FEW, _VERY_FEW = 128, 16
-# Up to so many particles a program is compiled with less effort, in a half or a sixth of the time; what that costs in
-# running is about a millisecond a call.
-_PLAIN: Any = {"xla_cpu_use_fusion_emitters": False, "xla_cpu_parallel_codegen_split_count": 1}
+# Options of XLA on CPUs. Its matrix products here are too small to share among threads; threads.py does that with whole
+# pieces. Up to so many particles a program is compiled with less effort, in a half or a sixth of the time; what that
+# costs in running is about a millisecond a call.
+_ALONE: Any = {"xla_cpu_multi_thread_eigen": False}
+_PLAIN: Any = _ALONE | {"xla_cpu_use_fusion_emitters": False, "xla_cpu_parallel_codegen_split_count": 1}
 _EFFORT = (
     (_FEW, _PLAIN | {"xla_backend_optimization_level": 0}),
     (2048, _PLAIN | {"xla_backend_optimization_level": 1}),
+    (np.inf, _ALONE),
 )
 
 # How often the local phase was compiled; read by the tests.
@@ -73,7 +76,7 @@ def _in_size_classes(function: Any) -> Any:
     """Compile ``function(scheme, points, kernel, ids, neighbours, operands, each, whole)``, and call it
     with every particle axis padded: that of ``ids``, and that of the cloud."""
     program = jax.jit(function, static_argnums=(0,))
-    quick = [(most, jax.jit(function, static_argnums=(0,), compiler_options=options)) for most, options in _EFFORT]
+    on_cpu = [(most, jax.jit(function, static_argnums=(0,), compiler_options=options)) for most, options in _EFFORT]
 
     @wraps(function)
     def padded(scheme, points, kernel, ids, neighbours, operands, each=(), whole=()):
@@ -89,7 +92,7 @@ def _in_size_classes(function: Any) -> Any:
         )  # fmt: skip
         run = program
         if jax.default_backend() == "cpu" and not _inside(arguments):
-            run = next((some for most, some in quick if size <= most), program)
+            run = next(some for most, some in on_cpu if size <= most)
         made = run(scheme, *arguments)
         # Cut on the host where nothing is traced: an eager slice would compile for every length.
         return jax.tree.map(lambda x: (x if isinstance(x, jax.core.Tracer) else np.asarray(x))[:m], made)
