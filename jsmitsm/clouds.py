@@ -248,6 +248,8 @@ def _describe_groups(groups: Any) -> str:
 def interval(a: float, b: float, n: int) -> Cloud:
     """``n`` equally spaced particles on [a, b], ascending; groups interior, left, right.
 
+    Raises ValueError unless b > a and n is at least 2.
+
     >>> import jsmitsm as js
     >>> js.interval(0.0, 1.0, 5).spacing
     0.25
@@ -262,7 +264,8 @@ def rectangle(
 
     Groups: interior, left, right, bottom, top; a corner belongs to the first that claims it, in
     that order. ``jitter`` moves interior particles by up to that fraction of the spacing along
-    each axis, reproducibly by ``seed``.
+    each axis, reproducibly by ``seed``. Raises ValueError for an empty rectangle, fewer than two
+    particles along an axis, or a jitter of half a spacing or more.
 
     >>> import jsmitsm as js
     >>> len(js.rectangle((0, 0), (4, 9), (5, 10)))
@@ -272,8 +275,8 @@ def rectangle(
 
 
 def box(lo: Sequence[float], hi: Sequence[float], shape: Sequence[int], jitter: float = 0.0, seed: int = 0) -> Cloud:
-    """A lattice of ``shape = (nx, ny, nz)`` particles on a box; like :func:`rectangle` with
-    the groups front (low z) and back (high z) besides.
+    """A lattice of ``shape = (nx, ny, nz)`` particles on the box from ``lo`` to ``hi``; ``jitter``,
+    ``seed`` and errors as for :func:`rectangle`, with the groups front (low z) and back (high z) besides.
 
     >>> import jsmitsm as js
     >>> sorted(js.box((0, 0, 0), (1, 1, 1), (3, 3, 3)).groups)

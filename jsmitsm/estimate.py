@@ -119,7 +119,7 @@ def _strongest(weights: Any, xp: Any) -> Any:
 
 
 class Factorization:
-    """A problem ready to be solved again; made by :func:`factorize`.
+    """A problem ready to be solved again; made by :func:`factorize`, which has an example.
 
     ``solve(problem)`` keeps the neighbours, the rows and the factors as long as only the source and
     the values in the conditions changed, and makes anew what else did.
@@ -134,7 +134,10 @@ class Factorization:
 
     @bar("solve")
     def solve(self, problem: Problem) -> Solution:
-        """The solution of a problem with the same operator: (source and boundary values may differ)."""
+        """The solution of a problem with the same operator; source and boundary values may differ.
+
+        Raises ValueError for another kind of operator or conditions, SolveError as :func:`jsmitsm.solve` does.
+        """
         old = self._disc
         disc = discretized(
             problem, old.cloud, old.scheme.method, old.rec.order, old.kernel, Stencils(dz.table(old), None)
@@ -180,6 +183,7 @@ def factorize(
     Returns an object whose ``solve(problem)`` reuses everything that a change of the source or of
     the values in the conditions leaves valid: neighbours, moment systems, ordering and factors.
 
+    ``method``, ``order``, ``kernel``, ``stencils`` and ``solver`` as for :func:`jsmitsm.solve`.
     Raises ValueError for a nonlinear problem: its matrix changes in every step.
 
     Examples

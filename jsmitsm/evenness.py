@@ -40,6 +40,8 @@ def quality(cloud: Cloud, spacing: Any = None) -> Quality:
     the least over the mean nearest distance, in local spacings; ``fill_distance`` and ``separation_distance`` the
     first two in length units (Wendland, Scattered Data Approximation, 2005, has half the latter).
 
+    Raises ValueError for fewer than D + 2 particles, and normals that point inward.
+
     >>> import jsmitsm as js
     >>> round(js.quality(js.rectangle((0, 0), (1, 1), (11, 11))).mesh_ratio, 3)
     1.414

@@ -94,8 +94,9 @@ def from_mesh(mesh: Any, tags: str | None = None) -> Cloud:
 def from_shapely(polygon: Any, spacing: Any, seed: int = 0, groups: Any = None) -> Cloud:
     """Particles of a shapely ``Polygon`` with its holes; everything else as in :func:`jsmitsm.from_polygon`.
 
-    ``polygon`` may also be its well-known text (which needs shapely: ``pip install "jsmitsm[mesh]"``).
-    Raises ValueError for other geometries; the parts of a ``MultiPolygon`` are solved one by one.
+    ``spacing``, ``seed`` and ``groups`` as there. ``polygon`` may also be its well-known text (which needs shapely:
+    ``pip install "jsmitsm[mesh]"``). Raises ValueError for other geometries; the parts of a ``MultiPolygon`` are solved
+    one by one.
 
     >>> import shapely, jsmitsm as js
     >>> sorted(js.files.from_shapely(shapely.box(0, 0, 2, 1).difference(shapely.Point(1, 0.5).buffer(0.2)), 0.1).groups)
@@ -116,7 +117,13 @@ def from_csv(path: Any) -> Cloud:
     """A cloud from a CSV file with a header: columns ``x`` (``y``, ``z``) and ``group``; normals in ``nx`` (``ny``,
     ``nz``) where there are any, empty in the interior. Other columns are ignored. :func:`to_csv` writes such files.
 
-    Raises ValueError for a missing column or a cell that is no number, with its line.
+    Raises ValueError for a missing column or a cell that is no number, with its line. ``path``: a name or a path.
+
+    >>> import os, tempfile, jsmitsm as js
+    >>> path = os.path.join(tempfile.mkdtemp(), "cloud.csv")
+    >>> js.files.to_csv(js.interval(0.0, 1.0, 3), path)
+    >>> js.files.from_csv(path)
+    Cloud(3 particles in 1D, groups {interior: 1, left: 1, right: 1})
     """
     with open(path, newline="", encoding="utf-8-sig") as file:
         rows = list(csv.DictReader(file, skipinitialspace=True))
@@ -135,7 +142,8 @@ def from_csv(path: Any) -> Cloud:
 def to_csv(what: Cloud | Solution, path: Any) -> None:
     """Write a cloud, or a solution with its cloud, as CSV: coordinates, group, normals and the values ``u``.
 
-    Numbers are written so that they read back to the last bit.
+    ``what``: a cloud or a solution; ``path``: a name or a path. Numbers are written so that they read back to the
+    last bit, see :func:`from_csv`.
     """
     columns = _columns(what)
     with open(path, "w", newline="", encoding="utf-8") as file:
@@ -149,7 +157,8 @@ def to_mesh(sol: Solution, **more: Any) -> Any:
     """The solution on a mesh of triangles (lines, tetrahedra) between its particles, a ``meshio.Mesh``.
 
     ``to_mesh(sol).write("u.vtu")`` makes a file for ParaView. ``more``: further point data (N,) or (N, F), as in
-    ``to_mesh(sol, estimate=sol.error_estimate())``. Holes stay open. Needs meshio: ``pip install "jsmitsm[mesh]"``.
+    ``to_mesh(sol, estimate=sol.error_estimate())``. Holes stay open. Raises ValueError for data
+    of another length. Needs meshio: ``pip install "jsmitsm[mesh]"``.
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jsmitsm as js
@@ -170,8 +179,8 @@ def to_mesh(sol: Solution, **more: Any) -> Any:
 
 
 def to_pandas(what: Cloud | Solution, **more: Any) -> Any:
-    """A cloud, or a solution with its cloud, as a ``pandas.DataFrame``: one row per particle, coordinates, group,
-    normals, and ``u`` (``u0``, ``u1``, ... for a system). ``more``: further columns (N,).
+    """``what``, a cloud or a solution with its cloud, as a ``pandas.DataFrame``: one row per particle, coordinates,
+    group, normals, and ``u`` (``u0``, ``u1``, ... for a system). ``more``: further columns (N,).
 
     Needs pandas: ``pip install "jsmitsm[tables]"``.
 
@@ -187,6 +196,13 @@ def to_xarray(sol: Solution, **more: Any) -> Any:
     coordinates and groups as coordinates, method and order as attributes. ``more``: further variables (N,).
 
     Needs xarray: ``pip install "jsmitsm[tables]"``.
+
+    >>> import jax; jax.config.update("jax_enable_x64", True)
+    >>> import jsmitsm as js
+    >>> ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(1.0)}
+    >>> sol = js.solve(js.Problem(lambda u, x: js.laplacian(u)(x), ends), js.interval(0.0, 1.0, 9))
+    >>> js.files.to_xarray(sol).u.sizes["particle"]
+    9
     """
     xarray = _needed("xarray", "tables")
     columns = _columns(sol.cloud)

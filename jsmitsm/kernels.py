@@ -27,12 +27,19 @@ class Kernel:
     d : dimensionless support radius; a particle has the neighbours |x - x_i| <= d h.
     params : any pytree of numbers, further parameters of the profile.
 
+    Raises
+    ------
+    ValueError
+        For an h or d that is not positive and finite, and a profile that is no function of a scalar.
+
     Examples
     --------
     >>> import jsmitsm as js
     >>> kernel = js.Kernel(lambda r: (2.0 - r) ** 4, h=0.1, d=2.0)
     >>> float(kernel.weight(1.0)), float(kernel.weight(2.5))
     (1.0, 0.0)
+    >>> kernel.replace(h=0.2)
+    Kernel(h=0.2, d=2)
     """
 
     def __init__(self, profile: Callable[..., Any], h: Any, d: Any, params: Any = None):
@@ -62,7 +69,7 @@ class Kernel:
         return self.replace(h=self.h[i]) if jnp.ndim(self.h) else self
 
     def replace(self, **changes: Any) -> Kernel:
-        """The same kernel with another ``h``, ``d`` or ``params``."""
+        """The same kernel with other ``changes``: ``h``, ``d`` or ``params``; ValueError for other names."""
         unknown = sorted(set(changes) - {"h", "d", "params"})
         if unknown:
             raise ValueError(f"{unknown[0]}: no parameter of {type(self).__name__}; it has 'h', 'd' and 'params'")
@@ -112,7 +119,7 @@ class SuperGaussian(_Named):
         return (self.d**2 - r**2) * jnp.exp(-(r**2))
 
     def normalization(self, dim: int) -> Any:
-        """The constant G / (h sqrt(pi))^D of eq. (30)."""
+        """The constant G / (h sqrt(pi))^D of eq. (30), ``dim`` = D; ValueError unless that is 1, 2 or 3."""
         if dim not in (1, 2, 3):
             raise ValueError(f"dim: expected 1, 2 or 3 dimensions, got {dim!r}")
         return (1.04823, 1.10081, 1.18516)[dim - 1] / (self.h * np.sqrt(np.pi)) ** dim

@@ -111,6 +111,11 @@ def discretize(
     scheme = replace(scheme, **_conditions_layout(groups, rec), sourced=sourced)
     if len(images.owner) and method in ("I", "II"):
         raise ValueError(f"method: {method} does not follow periodic conditions; use S, III or SSPH")
+    if scheme.n_data and method in ("I", "II", "III"):
+        raise ValueError(
+            f"method: {method} takes one condition where values are held, but a boundary has more (as a clamped "
+            'plate has); use "S" or "SSPH"'
+        )
     if kernel is not None and not is_traced(kernel) and np.shape(kernel.h) not in ((), (len(cloud),)):
         raise ValueError(
             f"kernel: h has shape {np.shape(kernel.h)}, expected a scalar or one per particle, ({len(cloud)},)"

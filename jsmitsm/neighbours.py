@@ -42,6 +42,7 @@ class Stencils:
 
     @property
     def width(self) -> int:
+        """The largest number of neighbours, the particle itself counted."""
         return self.indices.shape[1]
 
     def __len__(self) -> int:

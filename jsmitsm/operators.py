@@ -305,7 +305,7 @@ def grad(u: Any) -> Any:
     """The gradient of ``u``, a function of the point; derivatives on the last axis.
 
     ``grad(u)(x)`` is (D,) for a scalar ``u``, (F, D) for a vector.  ``u`` is a field or any
-    function of a point (D,).
+    function of a point (D,). Raises ``ValueError`` for what is neither.
 
     >>> import jax.numpy as jnp
     >>> grad(lambda y: y[0] * y[1])(jnp.array([3.0, 5.0])).tolist()
@@ -321,6 +321,8 @@ def grad(u: Any) -> Any:
 
 def hessian(u: Any) -> Any:
     """The second derivatives of ``u``, a function of the point: (D, D), or (F, D, D).
+
+    Raises ``ValueError`` for what is neither a field nor a function.
 
     >>> import jax.numpy as jnp
     >>> hessian(lambda y: y[0] ** 2 * y[1])(jnp.array([3.0, 5.0])).tolist()
@@ -344,6 +346,8 @@ def hessian(u: Any) -> Any:
 
 def laplacian(u: Any) -> Any:
     """The sum of the second derivatives of ``u``, a function of the point: a scalar, or (F,).
+
+    Raises ``ValueError`` for what is neither a field nor a function.
 
     >>> import jax.numpy as jnp
     >>> float(laplacian(lambda y: y[0] ** 2 * y[1])(jnp.array([3.0, 5.0])))

@@ -34,6 +34,7 @@ def cloud(what: Any, *, normals: bool = False, support: int | None = None, kerne
     support : a particle whose support is shown: its neighbours are ringed, and with ``kernel`` the
         ball |x - x_i| <= d h is drawn.
     kernel, stencils : where the support comes from; a Solution brings its own neighbours.
+    legend : name the groups and count their particles.
     ax : axes to draw on; in 3D they need ``projection="3d"``.
 
     Raises
@@ -86,11 +87,18 @@ def solution(sol: Solution, *, field: int = 0, exact: Any = None, at: Mapping[st
 
     Parameters
     ----------
+    sol : a :class:`jsmitsm.Solution`.
     field : the field of a system.
     exact : 1D only: the exact solution to draw beside it, a function of one point x (1,).
     at : 3D only: positions of the slices by axis, ``{"z": 0.5}``; the middle of every axis if not given.
     levels : about how many contour levels.
+    colorbar : draw one, for 2D and 3D.
     ax : axes; in 3D one for every slice.
+
+    Raises
+    ------
+    ValueError
+        For a field, a slice or a number of axes that does not fit.
 
     Returns
     -------
@@ -131,8 +139,8 @@ def solution(sol: Solution, *, field: int = 0, exact: Any = None, at: Mapping[st
 
 def values(cloud: Cloud, numbers: Any, *, log: bool = False, label: str = "", at: Mapping[str, float] | None = None,
            levels: int = 20, colorbar: bool = True, ax: Any = None) -> Any:  # fmt: skip
-    """Any numbers (N,) at the particles as a map; ``log`` for a logarithmic scale. ``at`` and ``ax`` as in
-    :func:`solution`.
+    """Any numbers (N,) at the particles as a map; ``log`` for a logarithmic scale. ``at``, ``levels``,
+    ``colorbar`` and ``ax`` as in :func:`solution`. Raises ValueError unless ``numbers`` are (N,) and finite.
 
     Examples
     --------
@@ -160,7 +168,8 @@ def values(cloud: Cloud, numbers: Any, *, log: bool = False, label: str = "", at
 def error(sol: Solution, exact: Any, *, field: int = 0, log: bool = True, ax: Any = None, **options: Any) -> Any:
     """The error |u - exact| at the particles; ``exact`` is an array (N,) or a function of one point x (D,).
 
-    ``options`` go to :func:`values`.
+    ``sol`` and ``field`` as in :func:`solution`, ``log`` and ``options`` go to :func:`values`. Raises ValueError for
+    an exact solution of another size.
 
     Examples
     --------
@@ -181,7 +190,15 @@ def error(sol: Solution, exact: Any, *, field: int = 0, log: bool = True, ax: An
 def estimate(sol: Solution, *, field: int = 0, log: bool = True, ax: Any = None, **options: Any) -> Any:
     """The estimated error of a solution at the particles, :meth:`jsmitsm.Solution.error_estimate`, as a map.
 
-    ``options`` go to :func:`values`.
+    ``sol`` and ``field`` as in :func:`solution`, ``log``, ``ax`` and ``options`` go to :func:`values`.
+
+    Examples
+    --------
+    >>> import jax; jax.config.update("jax_enable_x64", True)
+    >>> import jsmitsm as js
+    >>> problem = js.Problem(lambda u, x: js.laplacian(u)(x) - 12 * x[0] ** 2,
+    ...                      {"left": js.dirichlet(0.0), "right": js.dirichlet(1.0)})
+    >>> ax = js.plot.estimate(js.solve(problem, js.interval(0.0, 1.0, 9), order=2))
     """
     numbers = np.abs(drawing.field_of(sol.error_estimate(), field))
     return values(sol.cloud, numbers, log=log, ax=ax, **{"label": "estimated error"} | options)
@@ -224,7 +241,8 @@ def tuning(result: Any, *, ax: Any = None) -> Any:
 
     ``result``: what :func:`jsmitsm.tune` returned, or its ``history``: a mapping from ``"objective"`` and the
     parameters' names to one entry per step, or a pytree of such. A parameter with one number per particle is
-    drawn as its median and its range. Returns an array of axes, one per panel.
+    drawn as its median and its range. ``ax``: as many axes as there are panels. Returns an array of them. Raises
+    ValueError for a history without ``"objective"``.
 
     Examples
     --------
@@ -269,6 +287,12 @@ def convergence(spacing: Any, errors: Any, *, floor: float = 1e-13, xlabel: str 
     errors : (M,) errors, or a mapping from a name to them for several lines.
     floor : errors below it are round-off and take no part in the order, which is the slope of the
         least-squares line through the others.
+    xlabel, ylabel : names of the axes.
+
+    Raises
+    ------
+    ValueError
+        For errors that are not positive, or not as many as there are spacings.
 
     Examples
     --------

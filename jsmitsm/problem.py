@@ -56,6 +56,8 @@ def dirichlet(value: Any, field: int | None = None) -> Condition:
         or a function returning (F,).
     field : the field it holds for; all of them if not given.
 
+    Raises ValueError for what is no number, array or function, and for NaN.
+
     >>> import jsmitsm as js
     >>> js.dirichlet(1.0)
     dirichlet(value=1.0)
@@ -74,7 +76,9 @@ def neumann(value: Any, field: int | None = None) -> Condition:
 
 
 def robin(a: Any, b: Any, value: Any, field: int | None = None) -> Condition:
-    """a u + b n . grad u = value on a group; each of the three as ``value`` in :func:`dirichlet`.
+    """a u + b n . grad u = value on a group; each of the three, and ``field``, as in :func:`dirichlet`.
+
+    Raises ValueError where ``a`` and ``b`` are both zero.
 
     >>> import jsmitsm as js
     >>> js.robin(1.0, 2.0, 0.0)
@@ -91,7 +95,7 @@ def condition(residual: Callable[..., Any]) -> Condition:
     """A general condition, ``residual(u, x, n) = 0`` (and ``params`` last, where given).
 
     ``residual`` returns a scalar, or a vector where it states several conditions at once; ``n``
-    is the unit outward normal.
+    is the unit outward normal. Raises ValueError for what is no function.
 
     >>> import jsmitsm as js
     >>> js.condition(lambda u, x, n: n @ js.grad(u)(x) + u(x) ** 4)
@@ -106,6 +110,7 @@ def periodic(first: str, second: str) -> Condition:
     """The groups ``first`` and ``second`` are images of each other under a translation.
 
     Give it under the key of either group; the particles of ``second`` take the values of ``first``.
+    Raises ValueError unless two different names are given.
 
     >>> import jsmitsm as js
     >>> js.periodic("left", "right")
@@ -118,6 +123,8 @@ def periodic(first: str, second: str) -> Condition:
 
 def fix(indices: Any, value: Any, field: int | None = None) -> Condition:
     """Hold the particles ``indices`` (interior ones too) at ``value``; give it under any free key.
+
+    ``value`` and ``field`` as in :func:`dirichlet`. Raises ValueError for numbers that are none, or given twice.
 
     >>> import jsmitsm as js
     >>> js.fix([12], 0.0)
@@ -180,6 +187,12 @@ class Problem:
     params : any pytree of numbers. Where it is given, every function of the problem takes it as
         its last argument, and new numbers in it never recompile.
 
+    Raises
+    ------
+    ValueError
+        For a pde that is no function, conditions that are none or of fields that do not exist, and
+        params that are not finite numbers.
+
     Examples
     --------
     >>> import jsmitsm as js
@@ -210,7 +223,7 @@ class Problem:
         self.bcs = {name: _listed(name, value, self.fields) for name, value in bcs.items()}
 
     def replace(self, **changes: Any) -> Problem:
-        """The same problem with other ``params``, ``pde``, ``bcs`` or ``fields``."""
+        """The same problem with other ``changes``: ``params``, ``pde``, ``bcs`` or ``fields``; ValueError for more."""
         unknown = sorted(set(changes) - {"pde", "bcs", "fields", "params"})
         if unknown:
             raise ValueError(f"{unknown[0]}: no part of a Problem; it has pde, bcs, fields and params")

@@ -66,7 +66,12 @@ def ball(center: Any, radius: Any) -> Sdf:
 
 
 def circle(center: Any, radius: Any) -> Sdf:
-    """The disk |x - center| < radius in 2D, also called :func:`disk`; see :func:`ball`."""
+    """The disk |x - center| < radius in 2D, also called :func:`disk`; see :func:`ball`. Errors as there.
+
+    >>> import jax.numpy as jnp, jsmitsm as js
+    >>> float(js.sdf.circle((0, 0), 1.0)(jnp.array([3.0, 4.0])))
+    4.0
+    """
     return ball(_vector("center", center, 2), radius)
 
 
@@ -91,12 +96,22 @@ def box(lo: Any, hi: Any) -> Sdf:
 
 
 def rectangle(lo: Any, hi: Any) -> Sdf:
-    """The rectangle lo < x < hi in 2D; see :func:`box`."""
+    """The rectangle lo < x < hi in 2D; see :func:`box`. Errors as there.
+
+    >>> import jax.numpy as jnp, jsmitsm as js
+    >>> float(js.sdf.rectangle((0, 0), (2, 1))(jnp.array([1.0, 0.75])))
+    -0.25
+    """
     return box(_vector("lo", lo, 2), _vector("hi", hi, 2))
 
 
 def interval(a: Any, b: Any) -> Sdf:
-    """The interval a < x < b in 1D, a function of x (1,); see :func:`box`."""
+    """The interval a < x < b in 1D, a function of x (1,); see :func:`box`. Errors as there.
+
+    >>> import jax.numpy as jnp, jsmitsm as js
+    >>> float(js.sdf.interval(0, 2)(jnp.array([2.5])))
+    0.5
+    """
     return box((a,), (b,))
 
 
@@ -104,6 +119,10 @@ def half_space(point: Any, normal: Any) -> Sdf:
     """The half-space behind the plane (in 2D the line) through ``point``; ``normal`` (D,) points out of it.
 
     ``normal`` need not be of unit length. Raises ValueError for a zero normal.
+
+    >>> import jax.numpy as jnp, jsmitsm as js
+    >>> float(js.sdf.half_space((0, 0), (0, 2))(jnp.array([5.0, -3.0])))
+    -3.0
     """
     point = _vector("point", point)
     normal = _vector("normal", normal, np.shape(point)[0])
@@ -117,6 +136,11 @@ def ellipse(center: Any, semi_axes: Any) -> Sdf:
     """The ellipse (in 3D ellipsoid) sum ((x - center) / semi_axes)^2 < 1; both (D,).
 
     Not a true distance but k (k - 1) / |grad k|-like: exact zero level, first-order distance near it.
+    Raises ValueError for semi-axes that are not positive.
+
+    >>> import jax.numpy as jnp, jsmitsm as js
+    >>> float(js.sdf.ellipse((0, 0), (2, 1))(jnp.array([2.0, 0.0])))
+    0.0
     """
     center = _vector("center", center)
     axes = _positive("semi_axes", _vector("semi_axes", semi_axes, np.shape(center)[0]))
@@ -135,7 +159,14 @@ ellipsoid = ellipse
 
 
 def capsule(a: Any, b: Any, radius: Any) -> Sdf:
-    """All points closer than ``radius`` to the segment from ``a`` to ``b`` (D,): a stadium, a rod with round ends."""
+    """All points closer than ``radius`` to the segment from ``a`` to ``b`` (D,): a stadium, a rod with round ends.
+
+    Raises ValueError for a radius that is not positive.
+
+    >>> import jax.numpy as jnp, jsmitsm as js
+    >>> float(js.sdf.capsule((0, 0), (2, 0), 0.5)(jnp.array([1.0, 2.0])))
+    1.5
+    """
     a, radius = _vector("a", a), _positive("radius", radius)
     along = _vector("b", b, np.shape(a)[0]) - a
 
@@ -147,7 +178,14 @@ def capsule(a: Any, b: Any, radius: Any) -> Sdf:
 
 
 def cylinder(a: Any, b: Any, radius: Any) -> Sdf:
-    """The solid cylinder of flat ends around the axis from ``a`` to ``b`` (3,). Exact distance."""
+    """The solid cylinder of flat ends around the axis from ``a`` to ``b`` (3,). Exact distance.
+
+    Raises ValueError for a radius that is not positive.
+
+    >>> import jax.numpy as jnp, jsmitsm as js
+    >>> float(js.sdf.cylinder((0, 0, 0), (0, 0, 2), 1.0)(jnp.array([0.0, 3.0, 1.0])))
+    2.0
+    """
     a, radius = _vector("a", a, 3), _positive("radius", radius)
     along = _vector("b", b, 3) - a
 
@@ -162,7 +200,14 @@ def cylinder(a: Any, b: Any, radius: Any) -> Sdf:
 
 
 def torus(center: Any, major: Any, minor: Any, axis: Any = (0.0, 0.0, 1.0)) -> Sdf:
-    """The solid torus around ``center`` (3,): a tube of radius ``minor`` bent round ``axis`` with radius ``major``."""
+    """The solid torus around ``center`` (3,): a tube of radius ``minor`` bent round ``axis`` with radius ``major``.
+
+    Raises ValueError for radii that are not positive.
+
+    >>> import jax.numpy as jnp, jsmitsm as js
+    >>> float(js.sdf.torus((0, 0, 0), 2.0, 0.5)(jnp.array([2.0, 0.0, 1.5])))
+    1.0
+    """
     center, axis = _vector("center", center, 3), _vector("axis", axis, 3)
     major, minor = _positive("major", major), _positive("minor", minor)
 
@@ -181,6 +226,10 @@ def polygon(vertices: Any) -> Sdf:
     The gradient is the edge's normal on an edge and the normalised bisector at a vertex. A polygon
     with holes is ``difference(polygon(outer), polygon(hole))``. Whether it crosses itself is checked
     by :func:`jsmitsm.from_polygon`, not here. Raises ValueError for a wrong shape.
+
+    >>> import jax.numpy as jnp, jsmitsm as js
+    >>> float(js.sdf.polygon([(0, 0), (2, 0), (0, 2)])(jnp.array([0.5, -1.0])))
+    1.0
     """
     start = vertices if isinstance(vertices, jax.core.Tracer) else np.asarray(vertices, dtype=np.float64)
     if start.ndim != 2 or start.shape[1] != 2 or start.shape[0] < 3:
@@ -217,27 +266,54 @@ def polygon(vertices: Any) -> Sdf:
 
 
 def union(*shapes: Sdf) -> Sdf:
-    """What lies in any of the shapes (the smallest distance; exact outside, a bound inside)."""
+    """What lies in any of the shapes (the smallest distance; exact outside, a bound inside). ValueError without any.
+
+    >>> import jax.numpy as jnp, jsmitsm as js
+    >>> float(js.sdf.union(js.sdf.circle((0, 0), 1.0), js.sdf.circle((3, 0), 1.0))(jnp.array([3.0, 0.0])))
+    -1.0
+    """
     return _combine(jnp.minimum, shapes)
 
 
 def intersection(*shapes: Sdf) -> Sdf:
-    """What lies in all of the shapes (the largest distance; exact inside, a bound outside)."""
+    """What lies in all of the shapes (the largest distance; exact inside, a bound outside). ValueError without any.
+
+    >>> import jax.numpy as jnp, jsmitsm as js
+    >>> float(js.sdf.intersection(js.sdf.circle((0, 0), 1.0), js.sdf.circle((1, 0), 1.0))(jnp.array([0.5, 0.0])))
+    -0.5
+    """
     return _combine(jnp.maximum, shapes)
 
 
 def difference(shape: Sdf, *holes: Sdf) -> Sdf:
-    """What lies in ``shape`` and in none of the ``holes``."""
+    """What lies in ``shape`` and in none of the ``holes``. ValueError for what is no function.
+
+    >>> import jax.numpy as jnp, jsmitsm as js
+    >>> float(js.sdf.difference(js.sdf.circle((0, 0), 2.0), js.sdf.circle((0, 0), 1.0))(jnp.array([1.5, 0.0])))
+    -0.5
+    """
     return intersection(shape, *map(complement, holes))
 
 
 def complement(shape: Sdf) -> Sdf:
-    """What lies outside of ``shape``."""
+    """What lies outside of ``shape``.
+
+    >>> import jax.numpy as jnp, jsmitsm as js
+    >>> float(js.sdf.complement(js.sdf.circle((0, 0), 1.0))(jnp.array([0.0, 0.0])))
+    1.0
+    """
     return lambda x: -shape(x)
 
 
 def smooth_union(first: Sdf, second: Sdf, radius: Any) -> Sdf:
-    """The union with its seam filled over a width ``radius`` (length units); quadratic blend, C1."""
+    """The union with its seam filled over a width ``radius`` (length units); quadratic blend, C1.
+
+    Raises ValueError for a width that is not positive.
+
+    >>> import jax.numpy as jnp, jsmitsm as js
+    >>> float(js.sdf.smooth_union(js.sdf.circle((-1, 0), 1.0), js.sdf.circle((1, 0), 1.0), 0.5)(jnp.zeros(2)))
+    -0.125
+    """
     radius = _positive("radius", radius)
 
     def sdf(x: jax.Array) -> jax.Array:
@@ -249,13 +325,23 @@ def smooth_union(first: Sdf, second: Sdf, radius: Any) -> Sdf:
 
 
 def translate(shape: Sdf, offset: Any) -> Sdf:
-    """The shape moved by ``offset`` (D,)."""
+    """The shape moved by ``offset`` (D,). Raises ValueError for what is no vector.
+
+    >>> import jax.numpy as jnp, jsmitsm as js
+    >>> float(js.sdf.translate(js.sdf.circle((0, 0), 1.0), (3, 0))(jnp.array([3.0, 0.0])))
+    -1.0
+    """
     offset = _vector("offset", offset)
     return lambda x: shape(x - offset)
 
 
 def scale(shape: Sdf, factor: Any, center: Any = None) -> Sdf:
-    """The shape enlarged by ``factor`` > 0 about ``center`` (the origin by default)."""
+    """The shape enlarged by ``factor`` > 0 about ``center`` (the origin by default). ValueError for another factor.
+
+    >>> import jax.numpy as jnp, jsmitsm as js
+    >>> float(js.sdf.scale(js.sdf.circle((0, 0), 1.0), 3.0)(jnp.zeros(2)))
+    -3.0
+    """
     factor = _positive("factor", factor)
     middle = 0.0 if center is None else _vector("center", center)
     return lambda x: factor * shape(middle + (x - middle) / factor)
@@ -295,13 +381,25 @@ def round(shape: Sdf, radius: Any) -> Sdf:
     """The shape grown by ``radius``, its convex corners rounded with it (exact distances only).
 
     To keep the size, shrink the shape first: ``round(box(lo + r, hi - r), r)``.
+    Raises ValueError for a radius that is not positive.
+
+    >>> import jax.numpy as jnp, jsmitsm as js
+    >>> float(js.sdf.round(js.sdf.rectangle((0, 0), (2, 1)), 0.25)(jnp.array([1.0, 2.0])))
+    0.75
     """
     radius = _positive("radius", radius)
     return lambda x: shape(x) - radius
 
 
 def shell(shape: Sdf, thickness: Any) -> Sdf:
-    """The wall of the given thickness with the boundary of ``shape`` in its middle."""
+    """The wall of the given thickness with the boundary of ``shape`` in its middle.
+
+    Raises ValueError for a thickness that is not positive.
+
+    >>> import jax.numpy as jnp, jsmitsm as js
+    >>> float(js.sdf.shell(js.sdf.circle((0, 0), 1.0), 0.5)(jnp.array([1.0, 0.0])))
+    -0.25
+    """
     half = _positive("thickness", thickness) / 2
     return lambda x: jnp.abs(shape(x)) - half
 

@@ -45,6 +45,20 @@ class Solution:
 
     ``sol(points)`` evaluates it at points (M, D), ``sol.grad(points)`` its gradient.
     A solution is a pytree: it passes through ``jax.jit``, ``jax.grad`` and ``pickle``.
+
+    Examples
+    --------
+    >>> import jax; jax.config.update("jax_enable_x64", True)
+    >>> import jsmitsm as js
+    >>> ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(1.0)}
+    >>> # The answer is x^3.
+    >>> sol = js.solve(js.Problem(lambda u, x: js.laplacian(u)(x) - 6 * x[0], ends), js.interval(0.0, 1.0, 9))
+    >>> sol
+    Solution(u: 9, method='S', order=4, converged=True)
+    >>> [round(float(value[0]), 9) for value in (sol([[0.3]]), sol.grad([[0.3]])[0], sol.derivative([[0.3]], (2,)))]
+    [0.027, 0.27, 1.8]
+    >>> round(float(sol.flux("right")), 9), sol.coefficients.shape, bool(sol.error_estimate().max() < 1e-12), sol.flags
+    (3.0, (9, 5), True, [])
     """
 
     def __init__(self, values, cloud, recipe, fit, converged, iterations, stats, fitted=None, report=None):
@@ -62,18 +76,22 @@ class Solution:
 
     @property
     def method(self) -> str:
+        """The method it was solved with, "S" for instance."""
         return self._recipe.method
 
     @property
     def order(self) -> int:
+        """The degree of the local Taylor polynomials."""
         return self._recipe.order
 
     @property
     def u(self) -> Any:
+        """Values (N,) at the particles, in the cloud's order; (N, F) for a system."""
         return self._values[:, 0] if self._recipe.fields == 1 else self._values
 
     @property
     def coefficients(self) -> Any:
+        """Taylor coefficients d^a u / a!, (N, K), ordered as :func:`jsmitsm.multi_indices`; (N, K, F) for a system."""
         fitted = self._taylor
         return fitted[:, 0] if self._recipe.fields == 1 else jnp.swapaxes(fitted, 1, 2)
 
@@ -91,19 +109,25 @@ class Solution:
         """Values (M,) at ``points`` (M, D), (M, F) for a system.
 
         Each point takes the polynomial of its nearest particle, or with ``blend`` a smooth average
-        of those of its nearest few, which is continuous across the cloud.
+        of those of its nearest few, which is continuous across the cloud. A point outside of the
+        domain takes the polynomial of the particle nearest to it: an extrapolation, not checked.
+
+        Raises ValueError for points of another shape, NaN or infinite ones.
         """
         return self.derivative(points, (0,) * self.cloud.dim, blend=blend)
 
     def grad(self, points: Any, *, blend: bool = False) -> Any:
-        """Gradients (M, D) at ``points`` (M, D), (M, F, D) for a system."""
+        """Gradients (M, D) at ``points`` (M, D), (M, F, D) for a system; ``blend`` as for values.
+
+        Raises ValueError for points of another shape, NaN or infinite ones.
+        """
         unit = np.eye(self.cloud.dim, dtype=int)
         return jnp.stack([self.derivative(points, tuple(map(int, b)), blend=blend) for b in unit], axis=-1)
 
     def derivative(self, points: Any, multi_index: tuple[int, ...], *, blend: bool = False) -> Any:
-        """The derivative d^b u at ``points`` (M, D), |b| at most the order: (M,) or (M, F).
+        """The derivative d^b u at ``points`` (M, D), b = ``multi_index``, |b| at most the order: (M,) or (M, F).
 
-        Blending averages the polynomials' derivatives.
+        With ``blend`` the polynomials' derivatives are averaged. Raises ValueError for wrong points or orders.
         """
         points = _checked_points(points, self.cloud.dim)
         b = tuple(int(v) for v in multi_index)
@@ -117,7 +141,10 @@ class Solution:
         return values[:, 0] if self._recipe.fields == 1 else values
 
     def integral(self, group: str) -> Any:
-        """The integral of u over a boundary group, a scalar or (F,); see :func:`jsmitsm.quadrature`."""
+        """The integral of u over a boundary group, a scalar or (F,); see :func:`jsmitsm.quadrature`.
+
+        Raises ValueError for a group that is no boundary group.
+        """
         from jsmitsm.boundary_quadrature import quadrature
 
         points, weights, _ = quadrature(self.cloud, group)
@@ -127,6 +154,8 @@ class Solution:
         """The integral of conductivity n . grad u over a boundary group, n outward: a scalar or (F,).
 
         conductivity : a number, or a function of one point x (D,).
+
+        Raises ValueError for a group that is no boundary group.
         """
         from jsmitsm.boundary_quadrature import quadrature
 
@@ -140,6 +169,7 @@ class Solution:
         """Estimated error |u - u_exact| at every particle, (N,) or (N, F); see :mod:`jsmitsm.estimate`.
 
         Computed when asked for: one more assembly at order p + 2 and one solve with the kept factors.
+        Raises ValueError for a solution that was pickled, and where the points are traced.
         """
         from jsmitsm.estimate import error_estimate
 

@@ -5,7 +5,10 @@ import io
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
+
+import jsmitsm as js
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()
@@ -80,3 +83,32 @@ def test_tables_agree_with_the_data():
         assert filled(text, found) == text, f"run python -m benchmarks.readme: {page.name} differs from the data"
         for _, name, body, _ in PLACE.findall(text):
             assert not body.strip() or name in found, f"{page.name}: the table {name} has no data"
+
+
+def refusals():
+    """What the README's table says it does not do, and part of the message that says so."""
+    sides = ("left", "right", "bottom", "top")
+    held = {side: js.dirichlet(0.0) for side in sides}
+    square = js.rectangle((0, 0), (1, 1), (6, 6))
+
+    def solve(pde=lambda u, x: js.laplacian(u)(x) + 1.0, bcs=held, fields=1, **options):
+        return lambda: js.solve(js.Problem(pde, bcs, fields), square, **options)
+
+    yield "a point other than x", solve(lambda u, x: js.laplacian(u)(x) - u(0.9 * x))
+    yield "must be real", solve(lambda u, x: js.laplacian(u)(x) + 1j)
+    yield "D = 1, 2 or 3", lambda: js.Cloud(np.eye(4), {"interior": [0, 1], "rim": [2, 3]})
+    clamped = {side: [js.dirichlet(0.0), js.neumann(0.0)] for side in sides}
+    around = {"left": js.periodic("left", "right"), "bottom": held["bottom"], "top": held["top"]}
+    for method in ("I", "II", "III"):
+        two = lambda u, x: js.laplacian(u)(x) - u(x)[::-1]
+        yield "treats one field", solve(two, fields=2, method=method)
+        plate = lambda u, x: js.laplacian(js.laplacian(u))(x) - 1.0
+        yield "takes one condition where values are held", solve(plate, clamped, method=method, order=6)
+        if method != "III":
+            yield "does not follow periodic", solve(bcs=around, method=method)
+
+
+@pytest.mark.parametrize("message, call", list(refusals()))
+def test_what_the_table_says_it_does_not_do_is_refused(message, call):
+    with pytest.raises(ValueError, match=message):
+        call()
