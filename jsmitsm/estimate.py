@@ -52,7 +52,7 @@ def error_estimate(solution: Solution) -> Any:
     data, r, c = dz.matrix(low, classes, rows)
     x, _ = run.solved(data, r, c, ratio * defect[0].reshape(-1)[free], balanced=False)
     zero = np.zeros(low.held.size)
-    error = jnp.asarray(zero).at[free].set(x) if is_traced(x) else _put(zero, free, x)
+    error: Any = jnp.asarray(zero).at[free].set(x) if is_traced(x) else _put(zero, free, x)
     error = abs(error).reshape(low.held.shape)
     return error[:, 0] if low.rec.fields == 1 else error
 

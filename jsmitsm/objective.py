@@ -40,6 +40,8 @@ SHAKE = 0.02
 # Up to so many particles score and gradient are one compiled program. Beyond, what the program
 # would hold as constants takes long to compile, and a step is long anyway.
 COMPILED = 3000
+# A few dozen calls do not repay an optimising compiler, which takes five times as long.
+QUICKLY: Any = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 0}
 
 
 class Score(NamedTuple):
@@ -152,8 +154,9 @@ class Objective:
         key = self.bound, self.scale
         if key not in self._compiled:
             graded = jax.value_and_grad(lambda z: self.score(kernel_of(z)), has_aux=True)
-            fast = self.linear and len(self.cloud) <= COMPILED
-            self._compiled = {key: jax.jit(graded) if fast else graded}
+            if self.linear and len(self.cloud) <= COMPILED:
+                graded = jax.jit(graded, compiler_options=QUICKLY if jax.default_backend() == "cpu" else None)
+            self._compiled = {key: graded}
         (score, (value, lebesgue, defect, values, taylor)), slope = self._compiled[key](z)
         defect, values, taylor = jax.tree.map(np.asarray, (defect, values, taylor))
         return Score(float(score), slope, float(value), float(lebesgue), defect, values, taylor)
