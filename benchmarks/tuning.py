@@ -1,9 +1,12 @@
 """Tuning a kernel without knowing the solution, against a grid search that knows it.
 
-``python -m benchmarks.tuning [names] [--quick]`` tunes (h, d) of the paper's kernel with the objective
-"estimate" from two starts, prints a table and writes ``benchmarks/data/tuning.json``. Errors are
-relative L2 norms over all particles, in percent. ``grid`` is the 10th percentile of the true error over a
-grid of (h, d) within the Lebesgue bound: a choice that needs the exact solution.
+``python -m benchmarks.tuning [names] [--quick] [--again]`` tunes (h, d) of the paper's kernel with the
+objective "estimate" from two starts, and one h per particle on clouds whose density varies 1:20 and 1:400.
+It prints tables and writes ``benchmarks/data/tuning.json`` line by line: a run that was stopped goes on
+where it was, ``names`` pick problems, ``--again`` makes their lines anew, ``--table`` only prints what is there.
+
+Errors are relative L2 norms over all particles, in percent. ``grid`` is the 10th percentile of the true
+error over a grid of (h, d) within the Lebesgue bound: a choice that needs the exact solution.
 """
 
 from __future__ import annotations
@@ -23,6 +26,7 @@ import numpy as np
 import jsmitsm as js
 from benchmarks.machine import describe
 from benchmarks.problems import PAPER, Case
+from jsmitsm.objective import nearest_distance, reference
 
 DATA = Path(__file__).parent / "data" / "tuning.json"
 STARTS = (0.7, 2.0)
@@ -39,6 +43,7 @@ class Setup:
     """A problem on a cloud, and another solution of the same operator and cloud.
 
     orders : the order of SSPH, III and S.
+    spacing : that of the lattice, where the cloud is one that was jittered; else the smallest distance.
     """
 
     name: str
@@ -47,6 +52,7 @@ class Setup:
     orders: tuple[int, int, int]
     other: Case | None = None
     smooth: bool = True
+    spacing: float | None = None
 
 
 def _poisson(name: str, lo: tuple, hi: tuple, exact: Callable[[Any], Any], bcs: Any = None) -> Case:
@@ -89,6 +95,7 @@ def _setups() -> dict[str, Setup]:
         Setup(
             "jittered", _diffusion("jittered", smooth), lambda: js.rectangle(*square, (14, 14), jitter=0.25, seed=5),
             (2, 2, 4), _diffusion("jittered, other", lambda x: jnp.cos(3 * x[0]) * jnp.exp(x[1])),
+            spacing=1 / 13,
         ),
         Setup(
             "narrow peak", _poisson("peak", *square, peak(0.12)), lambda: js.rectangle(*square, (17, 17)), (2, 2, 4),
@@ -98,6 +105,7 @@ def _setups() -> dict[str, Setup]:
             "3D", _poisson("3D", *cube, lambda x: jnp.exp(x[0]) * jnp.sin(2 * x[1]) * jnp.cos(x[2])),
             lambda: js.box(*cube, (7, 7, 7), jitter=0.1, seed=2), (2, 2, 2),
             _poisson("3D, other", *cube, lambda x: jnp.cos(2 * x[0] + x[1]) * jnp.exp(-x[2])),
+            spacing=1 / 6,
         ),
     ]  # fmt: skip
     return {s.name: s for s in found}
@@ -132,7 +140,7 @@ class Bench:
 
 def bench(setup: Setup, method: str) -> Bench:
     cloud = setup.cloud()
-    spacing = cloud.spacing
+    spacing = setup.spacing or cloud.spacing
     order = setup.orders[METHODS.index(method)]
     return Bench(setup, method, order, cloud, spacing, stencils=js.stencils(cloud, radius=REACH * spacing * 1.0001))
 
@@ -163,16 +171,11 @@ def tuned(b: Bench, start: float, **options: Any) -> dict[str, Any]:
     return out
 
 
-def reference_error(b: Bench) -> float:
+def reference_error(case: Case, cloud: js.Cloud, order: int) -> float:
     """True error in percent of the solution that "estimate" measures against."""
-    from importlib import import_module
-
-    scene = import_module("jsmitsm.tuning")._Scene(
-        b.setup.case.problem(), b.cloud, js.SuperGaussian(b.spacing, 4.0), "estimate",
-        {"method": b.method, "order": b.order},
-    )  # fmt: skip
-    exact = b.setup.case.values(b.cloud.points)
-    return float(100 * np.linalg.norm(scene.reference[:, 0] - exact) / np.linalg.norm(exact))
+    values = reference(case.problem(), cloud, {"order": order})[:, 0]
+    exact = case.values(cloud.points)
+    return float(100 * np.linalg.norm(values - exact) / np.linalg.norm(exact))
 
 
 def record(setup: Setup, method: str, quick: bool) -> dict[str, Any]:
@@ -186,7 +189,7 @@ def record(setup: Setup, method: str, quick: bool) -> dict[str, Any]:
         "setup": setup.name, "smooth": setup.smooth, "method": method, "order": b.order, "particles": len(b.cloud),
         "spacing": b.spacing, "lebesgue_bound": bound, "paper": paper, "untuned": b.error(0.8, 4.0)[0],
         "grid_10th_percentile": float(np.quantile(admitted, 0.1)) if admitted else np.nan,
-        "grid_solves": len(points), "grid": points, "reference": reference_error(b),
+        "grid_solves": len(points), "grid": points, "reference": reference_error(setup.case, b.cloud, b.order),
         "runs": {str(h): tuned(b, h, steps=15 if quick else 50) for h in STARTS},
     }  # fmt: skip
 
@@ -223,20 +226,137 @@ def lines(entry: dict[str, Any]) -> list[str]:
     return out
 
 
+# ------------------------------------------------------------------ one h per particle
+
+
+@dataclass(frozen=True)
+class Graded:
+    """A cloud on the unit square, fine around one corner, and a solution as narrow as it is there.
+
+    fine, coarse : spacings at the corner and opposite to it.
+    """
+
+    name: str
+    fine: float
+    coarse: float
+
+    def cloud(self) -> js.Cloud:
+        spacing = lambda x: self.fine + (self.coarse - self.fine) * np.hypot(*x.T) / np.sqrt(2)
+        return js.from_sdf(js.sdf.box((0.0, 0.0), (1.0, 1.0)), ((0.0, 0.0), (1.0, 1.0)), spacing)
+
+    def case(self, shift: float = 0.0) -> Case:
+        """A logarithm with its pole a little outside of the corner."""
+        near = 6 * self.fine
+
+        def exact(x):
+            square = (x[0] + near + shift) ** 2 + (x[1] + near + 0.5 * shift) ** 2
+            return jnp.log(square) * (1.0 + x[0] * x[1])
+
+        return _poisson(self.name, (0.0, 0.0), (1.0, 1.0), exact)
+
+
+GRADED = {g.name: g for g in (Graded("density 1:20", 0.02, 0.09), Graded("density 1:400", 0.006, 0.12))}
+def record_graded(g: Graded, method: str, quick: bool) -> dict[str, Any]:
+    """The best scalar h that a grid finds, knowing the solution, against one tuned h per particle."""
+    cloud, order = g.cloud(), (2, 2, 4)[METHODS.index(method)]
+    own = nearest_distance(cloud.points)  # every particle's spacing
+    everyone = js.stencils(cloud, size=len(cloud))
+    problems = [js.Problem(c.pde, {"boundary": js.dirichlet(c.exact)}) for c in (g.case(), g.case(3 * g.fine))]
+    exact = [np.asarray(c.values(cloud.points)) for c in (g.case(), g.case(3 * g.fine))]
+    options = {"method": method, "order": order}
+
+    def error(h: Any, d: float, which: int = 0, near: js.Stencils | None = None) -> tuple[float, float]:
+        try:
+            sol = js.solve(problems[which], cloud, kernel=js.SuperGaussian(h, d), stencils=near, **options)
+        except (js.SolveError, ValueError):
+            return np.nan, np.nan
+        off = np.linalg.norm(sol.u - exact[which]) / np.linalg.norm(exact[which])
+        return 100 * float(off), float(sol.stats["lebesgue_max"])
+
+    widest = own.max()
+    ratios, radii = np.geomspace(0.4, 1.6, 4 if quick else 9), np.geomspace(1.6, 4.0, 3 if quick else 6)
+    points = [(r, d, *error(r * widest, d, near=everyone)) for r in ratios for d in radii if 1.4 < r * d < 4.5]
+    admitted = [p for p in points if np.isfinite(p[2]) and p[3] <= BOUND]
+    best = min(admitted, key=lambda p: p[2])
+    runs = {}
+    for start in STARTS:
+        begin = time.perf_counter()
+        kernel = js.SuperGaussian(start * own, 4.0)
+        found = js.tune(problems[0], cloud, kernel, steps=15 if quick else 60, progress=False, **options)
+        h, d = np.asarray(found.kernel.h), float(found.kernel.d)
+        runs[str(start)] = {
+            "start": error(start * own, 4.0)[0], "tuned": error(h, d)[0], "lebesgue": error(h, d)[1],
+            "other": error(h, d, 1)[0], "solves": found.solves, "seconds": time.perf_counter() - begin,
+            "d": d, "h_in_spacings": np.quantile(h / own, [0.0, 0.5, 1.0]).tolist(), "messages": found.messages,
+            "objective": np.asarray(found.history["objective"]).tolist(),
+        }  # fmt: skip
+    return {
+        "setup": g.name, "method": method, "order": order, "particles": len(cloud),
+        "density_ratio": float((own.max() / own.min()) ** 2), "grid": points, "grid_solves": len(points),
+        "scalar": best[2], "scalar_h": best[0] * widest, "scalar_d": best[1],
+        "scalar_other": error(best[0] * widest, best[1], 1, everyone)[0],
+        "graded": error(own, 4.0)[0], "graded_other": error(own, 4.0, 1)[0],
+        "reference": 100 * float(np.linalg.norm(reference(problems[0], cloud, options)[:, 0] - exact[0]) / np.linalg.norm(exact[0])),
+        "runs": runs,
+    }  # fmt: skip
+
+
+GRADED_HEAD = f"{'cloud':<15}{'method':<8}{'from':>5}{'start':>10}{'tuned':>10}{'scalar':>10}{'graded':>10}{'reference':>11}"
+GRADED_HEAD += f"{'other':>10}{'(scalar)':>10}{'solves':>8}{'(grid)':>8}  misses"
+
+
+def graded_lines(entry: dict[str, Any]) -> list[str]:
+    """The lines of the table of per-particle h."""
+    out = []
+    for start, run in entry["runs"].items():
+        judged = {
+            "scalar": run["tuned"] < entry["scalar"], "other": run["other"] < entry["scalar_other"],
+            "start": not run["tuned"] > run["start"] * (1 + 1e-9), "graded": run["tuned"] < entry["graded"],
+        }  # fmt: skip
+        numbers = run["start"], run["tuned"], entry["scalar"], entry["graded"], entry["reference"]
+        out.append(
+            f"{entry['setup']:<15}{entry['method'] + ' ' + str(entry['order']):<8}{start:>5}"
+            + "".join(f"{x:>{w}.3g}" for x, w in zip(numbers, (10, 10, 10, 10, 11)))
+            + f"{run['other']:>10.3g}{entry['scalar_other']:>10.3g}{run['solves']:>8}{entry['grid_solves']:>8}  "
+            + ", ".join(name for name, kept in judged.items() if not kept)
+        )
+    return out
+
+
+# ------------------------------------------------------------------ all of it
+
+ABOUT = """Relative L2 errors in percent. start: h = 0.7 or 2 spacings, d = 4; grid: 10th percentile of a grid that knows the
+solution; paper: h = 1 spacing, d = 4; reference: what "estimate" measures from; misses: the bounds not kept.
+"""
+ABOUT_GRADED = """
+One h per particle. start: 0.7 or 2 times every particle's own spacing; scalar: the best single h (and d) of a grid that knows
+the solution; graded: h = every particle's own spacing, d = 4; other: another solution of the same cloud.
+"""
+
+
 def main(arguments: list[str]) -> None:
     jax.config.update("jax_enable_x64", True)
-    quick = "--quick" in arguments
+    quick, again, only_table = (flag in arguments for flag in ("--quick", "--again", "--table"))
     wanted = [a for a in arguments if not a.startswith("-")]
-    names = [n for n in SETUPS if not wanted or any(w in n for w in wanted)]
-    print("Relative L2 errors in percent; start, tuned, grid (10th percentile), h = 0.8, paper: h = 1 spacing, d = 4.\n")
-    print(HEAD)
-    entries = []
+    names = [n for n in (*SETUPS, *GRADED) if not wanted or any(w in n for w in wanted)]
+    kept = {} if quick or not DATA.exists() else {(e["setup"], e["method"]): e for e in json.loads(DATA.read_text())["results"]}
+    head = None
     for name in names[:2] if quick and not wanted else names:
+        new_head = ABOUT + "\n" + HEAD if name in SETUPS else ABOUT_GRADED + "\n" + GRADED_HEAD
+        if new_head != head:
+            print(head := new_head)
         for method in METHODS:
-            entries.append(record(SETUPS[name], method, quick))
-            print("\n".join(lines(entries[-1])), flush=True)
-            if not quick and not wanted:
-                DATA.write_text(json.dumps({"machine": describe(), "results": entries}) + "\n")
+            key = name, method
+            if not only_table and (key not in kept or again):
+                make = record if name in SETUPS else record_graded
+                kept[key] = make((SETUPS | GRADED)[name], method, quick)
+                jax.clear_caches()  # hundreds of compiled programs otherwise
+                if not quick:
+                    order = [(n, m) for n in (*SETUPS, *GRADED) for m in METHODS]
+                    results = [kept[k] for k in order if k in kept]
+                    DATA.write_text(json.dumps({"machine": describe(), "results": results}) + "\n")
+            if key in kept:
+                print("\n".join((lines if name in SETUPS else graded_lines)(kept[key])), flush=True)
 
 
 if __name__ == "__main__":

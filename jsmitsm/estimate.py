@@ -5,12 +5,11 @@ from __future__ import annotations
 from copy import copy
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm import discretize as dz
-from jsmitsm.boundary import is_traced
+from jsmitsm.boundary import concrete, is_traced
 from jsmitsm.clouds import Cloud
 from jsmitsm.discretize import Discretization, Numbers
 from jsmitsm.kernels import Kernel
@@ -52,9 +51,9 @@ def error_estimate(solution: Solution) -> Any:
     ratio = xp.where(xp.isfinite(ratio) & (ratio != 0), ratio, 1.0)
     data, r, c = dz.matrix(low, classes, rows)
     x, _ = run.solved(data, r, c, ratio * defect[0].reshape(-1)[free], balanced=False)
-    zero = xp.zeros(low.held.size)
-    error = zero.at[free].set(x) if xp is jnp else _put(zero, free, x)
-    error = xp.abs(error).reshape(low.held.shape)
+    zero = np.zeros(low.held.size)
+    error: Any = jnp.asarray(zero).at[free].set(x) if is_traced(x) else _put(zero, free, x)
+    error = abs(error).reshape(low.held.shape)
     return error[:, 0] if low.rec.fields == 1 else error
 
 
@@ -74,8 +73,8 @@ def _put(array: np.ndarray, at: np.ndarray, value: Any) -> np.ndarray:
 def _higher(fit: Fit, low: Discretization) -> tuple[Discretization, Numbers]:
     """The same problem with method S of order p + 2 on its own stencils."""
     order = fit.recipe.order + 2
-    host = jax.lax.stop_gradient(fit.cloud.points)
-    if is_traced(host):
+    host = concrete(fit.cloud.points)
+    if host is None:
         raise ValueError(
             "error_estimate: the points are traced by a JAX transform, and the wider stencils it needs are found on "
             "the host; ask for it outside the transform"

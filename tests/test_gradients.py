@@ -16,7 +16,10 @@ import jsmitsm as js
 
 STEP = 5e-5
 BOUND = 1e-6
-NAMES = ("h", "d", "wall", "source", "diffusion", "reaction", "flux", "robin_a", "robin_b", "robin_value", "points")
+NAMES = (
+    "h", "d", "wall", "source", "diffusion", "reaction", "flux", "robin_a", "robin_b", "robin_value", "points", "tilt"
+)  # fmt: skip
+IN_2D = ("flux", "tilt")  # a Neumann side, and the angle by which its normals are turned
 
 
 class Case:
@@ -24,7 +27,7 @@ class Case:
 
     def __init__(self, dim, n, order, reach):
         self.dim, self.order = dim, order
-        self.names = [name for name in NAMES if dim > 1 or name != "flux"]  # no Neumann side in 1D
+        self.names = [name for name in NAMES if dim > 1 or name not in IN_2D]
         self.cloud = mm.jittered(dim, n, jitter=0.2)
         self.stencils = js.stencils(self.cloud, radius=1.05 * reach / (n - 1))
         groups = self.cloud.groups
@@ -34,7 +37,7 @@ class Case:
         self.theta = {
             "h": reach / 3.0 / (n - 1), "d": 3.0, "wall": np.sin(1.0 + x[groups[wall]].sum(axis=1)),
             "source": 2.0, "diffusion": 0.4, "reaction": 1.5, "flux": 0.7,
-            "robin_a": 2.0, "robin_b": 0.5, "robin_value": 0.3, "points": x,
+            "robin_a": 2.0, "robin_b": 0.5, "robin_value": 0.3, "points": x, "tilt": 0.0,
         }  # fmt: skip
 
     def problem(self, t):
@@ -51,11 +54,23 @@ class Case:
             bcs = {"left": slope, "right": robin, "bottom": js.dirichlet(t["wall"]), "top": js.dirichlet(0.5)}
         return js.Problem(pde, bcs, params={k: t[k] for k in ("source", "diffusion", "reaction", "flux")})
 
-    def u(self, t, method, solver):
+    def moved(self, t):
+        """The cloud with the points of the dict, every normal turned by its angle."""
+        if self.dim == 1:
+            return self.cloud.replace(points=t["points"])
+        inside = np.isnan(self.cloud.normals)
+        c, s = jnp.cos(t["tilt"]), jnp.sin(t["tilt"])
+        turned = np.where(inside, 0.0, self.cloud.normals) @ jnp.array([[c, s], [-s, c]])
+        return self.cloud.replace(points=t["points"], normals=jnp.where(inside, jnp.nan, turned))
+
+    def solution(self, t, method="S", solver="dense", problem=None):
         return js.solve(
-            self.problem(t), self.cloud.replace(points=t["points"]), method=method, order=self.order,
+            problem or self.problem(t), self.moved(t), method=method, order=self.order,
             kernel=js.SuperGaussian(h=t["h"], d=t["d"]), stencils=self.stencils, solver=solver,
-        ).u  # fmt: skip
+        )  # fmt: skip
+
+    def u(self, t, method, solver):
+        return self.solution(t, method, solver).u
 
     def objective(self, t, method="S", solver="dense"):
         return jnp.sum(self.weights * self.u(t, method, solver) ** 2)
@@ -193,6 +208,54 @@ def test_values_that_the_pde_closes_over(line):
         return jnp.sum(line.weights * sol.u**2)
 
     assert float(jax.grad(f)(1.3)) == pytest.approx(difference(f, 1.3, 1.0), rel=BOUND)
+
+
+# ------------------------------------------------------------------ every output of a solution
+
+PLACES = np.array([[0.21], [0.68]])
+# Sums with weights, so that no entry hides another; the estimate smoothed where |x| has its kink.
+OUTPUTS = {
+    "coefficients": lambda case, sol: jnp.sum(case.weights[:, None] * jnp.sin(sol.coefficients[:, 1:3])),
+    "values between particles": lambda case, sol: jnp.sum(sol(PLACES) * np.array([1.0, 0.7])),
+    "gradient between particles": lambda case, sol: jnp.sum(sol.grad(PLACES) * np.array([[1.0], [0.7]])),
+    "error estimate": lambda case, sol: 1e3 * jnp.sum(case.weights**2 * sol.error_estimate() ** 2),
+}
+
+
+def bent(t):
+    """u'' = s (1 + q u^2) exp(x), a nonlinear problem with the numbers of the dict."""
+    pde = lambda u, x, p: js.laplacian(u)(x) - p["source"] * jnp.exp(x[0]) * (1.0 + p["reaction"] * u(x) ** 2 / 4)
+    robin = js.robin(t["robin_a"], t["robin_b"], t["robin_value"])
+    params = {k: t[k] for k in ("source", "reaction")}
+    return js.Problem(pde, {"left": robin, "right": js.dirichlet(t["wall"])}, params=params)
+
+
+BENT = ("h", "d", "wall", "source", "reaction", "robin_a", "robin_b", "robin_value", "points")
+
+
+@pytest.mark.parametrize(
+    "method, problem, solver",
+    [("S", None, "dense"), ("III", None, "sparse"), ("SSPH", None, "dense"), ("S", bent, "sparse")],
+)  # fmt: skip
+def test_every_output_with_respect_to_everything(line, method, problem, solver):
+    """All outputs at once: the Jacobian in reverse mode, its columns against differences."""
+    def outputs(t):
+        sol = line.solution(t, method, solver, problem and problem(t))
+        return jnp.stack([make(line, sol) for make in OUTPUTS.values()])
+
+    values, pull = jax.vjp(outputs, line.theta)
+    rows = [pull(unit)[0] for unit in np.eye(len(values))]
+    for name in line.names if problem is None else BENT:
+        direction = line.direction(name)
+        measured = vector_difference(outputs, line.theta, direction)
+        for row, output, there in zip(rows, OUTPUTS, measured):
+            assert along(row, direction) == pytest.approx(there, rel=BOUND, abs=10 * BOUND), (output, name)
+        assert np.abs(measured).min() > 0, f"{name} moves nothing: nothing was tested"
+
+
+def vector_difference(function, t, direction):
+    at = lambda step: np.asarray(function(jax.tree.map(lambda x, v: x + step * v, t, direction)))
+    return (8 * (at(STEP) - at(-STEP)) - (at(2 * STEP) - at(-2 * STEP))) / (12 * STEP)
 
 
 def test_gradient_through_evaluation_between_particles(line):

@@ -14,6 +14,7 @@ import jsmitsm as js
 from jsmitsm import assembly
 
 room = import_module("jsmitsm.tuning")  # js.tune is the function
+from jsmitsm.objective import Objective
 
 N = 15
 
@@ -179,8 +180,8 @@ def test_the_support_stays_inside_given_stencils():
 
 
 def test_the_pattern_is_rebuilt_only_when_outgrown(monkeypatch):
-    built, made = [], room._Scene.discretized
-    monkeypatch.setattr(room._Scene, "discretized", lambda *a: built.append(1) or made(*a))
+    built, made = [], Objective.discretized
+    monkeypatch.setattr(Objective, "discretized", lambda *a: built.append(1) or made(*a))
     tuned(steps=8)
     assert len(built) == 1, "a shrinking support needs no new pattern"
     tuned(js.SuperGaussian(0.5 * s, 4.0), objective=lambda sol: -sol._fit.kernel.h * sol._fit.kernel.d, steps=8)
