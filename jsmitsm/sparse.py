@@ -85,7 +85,8 @@ class Factor:
     Attributes:
       info: dict of what was done: "backend", "unknowns", "entries", "factor_entries",
         "seconds" ("ordering", "factorisation", "solve": the last one), "iterations" and "residual"
-        of the last solve (the normwise backward error), "messages" (fallbacks, in words).
+        of the last solve (the normwise backward error), "order_kept" (whether `order` was given),
+        "messages" (fallbacks, in words).
 
     Raises:
       SingularMatrix: entries that are not finite, empty rows or columns, a singular matrix.
@@ -126,6 +127,7 @@ class Factor:
             "seconds": {"ordering": 0.0, "factorisation": 0.0, "solve": 0.0},
             "iterations": 0,
             "residual": 0.0,
+            "order_kept": order is not None,
             "messages": self.messages,
         }
         self._backends = choose_backends(n, len(data), points, solver, elliptic)

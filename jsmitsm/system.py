@@ -218,7 +218,7 @@ class Run:
             "neighbours": max((c.neighbours.shape[1] for c in disc.classes), default=0),
             "linear": self.linear,
             "formulation": self.formulation,
-            "skipped": skipped(disc),
+            "skipped": skipped(disc, self.linear, self.values is None),
             "messages": list(self.messages),
         }
         if "residual" in self.linear:
@@ -245,19 +245,26 @@ def _bordered(data, r, c, b, points, field, floating):
     return data, r, c, b, points
 
 
-def skipped(disc: Discretization) -> list[str]:
-    """What the scene made unnecessary."""
-    traced, method = disc.traced, disc.scheme.method
+def skipped(disc: Discretization, linear: dict[str, Any], traced: bool) -> list[str]:
+    """What the scene made unnecessary; ``linear``: what the linear solve tells of itself."""
+    method = disc.scheme.method
     out = []
+    if disc.given_stencils:
+        out.append("neighbour search")
     if method in ("S", "SSPH", "I"):
         out.append("kernel derivatives")
-    if traced.constant and disc.rec.scale_free:
+    if disc.traced.constant and disc.rec.scale_free:
         out.append("recursion per particle")
     if disc.repeated:
         out.append(f"moment systems of {disc.repeated} particles with repeated stencils")
-    if traced.source == "zero":
+    if disc.traced.source == "zero":
         out.append("particular part")
     if disc.held.all(axis=1).any():
         out.append(f"{int(disc.held.all(axis=1).sum())} particles with held values")
-    out += ["Taylor coefficients until asked for", "error estimate until asked for"]
-    return out
+    if linear.get("cached"):
+        out.append("factorisation, that of the same matrix was kept")
+    elif linear.get("order_kept"):
+        out.append("elimination order, that of the same pattern was kept")
+    if not traced:
+        out.append("bookkeeping for gradients")
+    return [*out, "Taylor coefficients until asked for", "error estimate until asked for"]
