@@ -44,15 +44,17 @@ class Operands(NamedTuple):
     """The numbers behind the rows of n particles.
 
     jac (n, E, S, T): Taylor coefficients of the operator's coefficients, or (1, E, S, 1) where
-    one set serves all; own (n, n_own, S_own): the particles' own conditions; data
-    (N, n_data, S_data): the conditions neighbours contribute, of every particle of the cloud;
-    shared: an elimination that is the same everywhere, with lifts for unit length.
+    one set serves all, or (n,) the numbers of the eliminations to use; own (n, n_own, S_own): the
+    particles' own conditions; data (N, n_data, S_data): the conditions neighbours contribute, of every
+    particle of the cloud; shared: an elimination that is the same everywhere, with lifts for unit length,
+    or several (B, ...) for the scales ``lengths`` (B,).
     """
 
     jac: Any
     own: Any
     data: Any
     shared: Elimination | None
+    lengths: Any = None
 
 
 def padded_size(n: int) -> int:
@@ -85,7 +87,7 @@ def _in_size_classes(function: Any) -> Any:
         cloud_wide = lambda tree: jax.tree.map(lambda x: _pad(x, n, big), tree)  # noqa: E731
         class_wide = lambda tree: jax.tree.map(lambda x: _pad(x, m, size), tree)  # noqa: E731
         jac = operands.jac if operands.jac.shape[0] == 1 else class_wide(operands.jac)
-        given = Operands(jac, class_wide(operands.own), cloud_wide(operands.data), operands.shared)
+        given = Operands(jac, class_wide(operands.own), cloud_wide(operands.data), operands.shared, operands.lengths)
         arguments = (
             cloud_wide(points), cloud_wide(kernel), class_wide(ids), class_wide(neighbours), given,
             class_wide(each), cloud_wide(whole),
@@ -185,6 +187,9 @@ def _prepared(scheme, points, kernel, i, near_ids, operands: Operands, jac, own)
     near = moments.support(points, i, near_ids, kernel)
     if operands.shared is None:
         solution = moments.eliminate(scheme, jac, near.length)
+    elif operands.lengths is not None:
+        near = moments.at_length(near, operands.lengths[jac])
+        solution = jax.tree.map(lambda x: x[jac], operands.shared)
     else:
         lift = operands.shared.lift * near.length ** jnp.asarray(row_levels(scheme.rec))
         solution = operands.shared._replace(lift=lift)

@@ -117,7 +117,7 @@ def least_squares(disc: Discretization, nums: Numbers, fits: list[Any] | None = 
 
 def _normal_part(disc: Discretization, nums: Numbers, cls: Class, shared: Any, fits: list[Any] | None) -> tuple:
     """What one class adds to the normal equations: entries as coordinates, and places and values on the right."""
-    given = operands(disc, nums, cls.ids, cls.scheme, shared)
+    given = operands(disc, nums, cls, shared)
     made = assembly.blocks(
         cls.scheme, disc.points, disc.kernel, cls.ids, cls.neighbours, given, right_sides(disc, nums, cls)
     )

@@ -54,6 +54,7 @@ class Discretization:
     n_own: np.ndarray  # (N,) own conditions of each particle
     given_stencils: bool  # the user's: nothing outside them is looked at
     repeated: int = 0  # particles whose moment system was that of another
+    lengths: int = 0  # eliminations of a constant operator, where one for all is not enough
 
     @property
     def points(self) -> Any:

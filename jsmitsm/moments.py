@@ -95,6 +95,11 @@ def support(points: Any, i: Any, neighbours: Any, kernel: Kernel | None) -> Supp
     return Support(offset / length, jnp.where(inside, weight, 0.0), inside, length, own)
 
 
+def at_length(near: Support, length: Any) -> Support:
+    """The same neighbours with their offsets scaled by another length."""
+    return near._replace(offset=near.offset * (near.length / length), length=length)
+
+
 def _default_kernel(distance: Any) -> Kernel:
     """A Gauss function that has fallen to exp(-4) at the farthest neighbour."""
     return Gaussian.tree_unflatten(None, (jnp.max(distance) / 2.0, 2.0, None))
@@ -128,22 +133,25 @@ def eliminate(scheme: Scheme, jac: Any, length: Any) -> Elimination:
     return Elimination(z[:, : len(scheme.free)], q, lift, rows)
 
 
-def eliminate_on_host(scheme: Scheme, jac: np.ndarray) -> Elimination:
-    """:func:`eliminate` at unit length in numpy, where one elimination serves all particles; kept for later."""
-    return _eliminated_once(scheme, jac.tobytes(), jac.shape, jac.dtype.str)
+def eliminate_on_host(scheme: Scheme, jac: np.ndarray, length: float = 1.0) -> Elimination:
+    """:func:`eliminate` in numpy, where one elimination serves many particles; kept for later."""
+    bare = Scheme(scheme.method, scheme.rec, scheme.free, scheme.dependent)
+    return _eliminated_once(bare, jac.tobytes(), jac.shape, jac.dtype.str, length)
 
 
-@lru_cache(maxsize=32)
-def _eliminated_once(scheme: Scheme, numbers: bytes, shape: tuple[int, ...], dtype: str) -> Elimination:
-    made = _eliminated(scheme, np.frombuffer(numbers, dtype).reshape(shape))
+@lru_cache(maxsize=256)
+def _eliminated_once(
+    scheme: Scheme, numbers: bytes, shape: tuple[int, ...], dtype: str, length: float
+) -> Elimination:
+    made = _eliminated(scheme, np.frombuffer(numbers, dtype).reshape(shape), length)
     for part in made:
         part.setflags(write=False)
     return made
 
 
-def _eliminated(scheme: Scheme, jac: np.ndarray) -> Elimination:
+def _eliminated(scheme: Scheme, jac: np.ndarray, length: float) -> Elimination:
     rec = scheme.rec
-    matrix, lift = constraints(rec, jac, 1.0, np)
+    matrix, lift = constraints(rec, jac, length, np)
     rows = matrix[np.array(rec.equation_rows)]
     white = np.kron(np.eye(rec.fields), whitening(rec.dim, rec.order))
     if scheme.method == "SSPH":

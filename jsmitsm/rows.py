@@ -25,21 +25,57 @@ from jsmitsm.threads import cores, side_by_side
 
 # Particles that the cores share in pieces, between whose ends a progress bar moves; every piece costs a millisecond.
 PIECE, MOST_PIECES = 4096, 32
+# Lengths that share an elimination differ by less than this ratio; particles that each elimination must serve.
+_STEP, _WORTH = 1.25, 50
 
 
-def operands(disc: Discretization, nums: Numbers, ids: np.ndarray, scheme: Scheme, shared: Any) -> Operands:
-    """What the particles ``ids`` need; the particle axis first."""
-    jac = nums.jac
+def operands(disc: Discretization, nums: Numbers, cls: Class, shared: Elimination | None) -> Operands:
+    """What the particles of a class need; the particle axis first."""
+    ids, scheme, jac, lengths = cls.ids, cls.scheme, nums.jac, None
     if jac.shape[-1] > 1:
         jac = jac[..., np.searchsorted(nums.ids, ids)]
     elif shared is not None:
         jac = np.zeros((1, 1, 1, 1))
+    else:
+        some = _eliminations(disc, nums, cls)
+        if some is not None:
+            shared, lengths, jac = some
     own = np.zeros((len(ids), 0, len(scheme.own)))
     if scheme.n_own:
         own = nums.own[np.searchsorted(nums.own_ids, ids), : scheme.n_own]
-    return Operands(
-        (jnp if is_traced(jac) else np).moveaxis(jac, -1, 0), own, disc.images.extend_values(nums.data), shared
-    )
+    jac = (jnp if is_traced(jac) else np).moveaxis(jac, -1, 0)
+    return Operands(jac, own, disc.images.extend_values(nums.data), shared, lengths)
+
+
+def _eliminations(disc: Discretization, nums: Numbers, cls: Class) -> tuple[Elimination, np.ndarray, np.ndarray] | None:
+    """A constant operator whose terms differ in order (laplacian(u) + k^2 u): one elimination for each of a few lengths.
+
+    Returns the eliminations (B, ...), their lengths (B,) and each particle's number (n,); None where that does not pay,
+    and where something is traced.
+    """
+    points, near, kernel = disc.points, cls.neighbours, disc.kernel
+    if not disc.traced.constant or cls.scheme.method != "S" or is_traced(points, near, kernel, nums.jac):
+        return None
+    if isinstance(nums.jac, jax.Array):
+        return None
+    if kernel is None:
+        points = np.asarray(points)
+        offset = points[np.where(near >= 0, near, cls.ids[:, None])] - points[cls.ids][:, None]
+        length = np.sqrt((offset**2).sum(axis=2).max(axis=1))
+    else:
+        h = np.broadcast_to(np.asarray(kernel.h), (len(points),))[cls.ids]
+        length = h * np.minimum(np.asarray(kernel.d), 2.0)
+    if not (length > 0).all():
+        return None
+    steps, place = np.unique(np.rint(np.log(length) / np.log(_STEP)).astype(int), return_inverse=True)
+    if len(cls.ids) < _WORTH * len(steps):
+        return None
+    disc.lengths = max(disc.lengths, len(steps))
+    # One program for any number of lengths up to the next power of two.
+    steps = np.concatenate([steps, np.full(max(4, 1 << (len(steps) - 1).bit_length()) - len(steps), steps[-1])])
+    lengths = float(_STEP) ** steps
+    made = [moments.eliminate_on_host(cls.scheme, nums.jac[..., 0], float(x)) for x in lengths]
+    return Elimination(*(np.stack(part) for part in zip(*made))), lengths, place
 
 
 def shared_elimination(disc: Discretization, nums: Numbers) -> Elimination | None:
@@ -62,7 +98,7 @@ def all_rows(disc: Discretization, nums: Numbers) -> tuple[list[Class], list[Row
 
 def _once_each(disc: Discretization, nums: Numbers, cls: Class, shared: Any) -> tuple[Class, Row]:
     """The rows of a class; repeated stencils of a constant operator are set up once."""
-    own = operands(disc, nums, cls.ids, cls.scheme, shared).own
+    own = operands(disc, nums, cls, shared).own
     one_size = disc.kernel is None or (not is_traced(disc.kernel) and np.ndim(disc.kernel.h) == 0)
     if not one_size or nums.jac.shape[-1] > 1 or cls.scheme.n_data or is_traced(cls.neighbours, disc.points, own):
         return cls, class_rows(disc, nums, cls, shared)
@@ -84,7 +120,7 @@ def _two_stage_rows(disc: Discretization, nums: Numbers, shared: Any) -> tuple[l
     parts, order = [], []
     for count in np.unique(conditioned):
         cls = Class(np.flatnonzero(conditioned == count), far, replace(disc.scheme, n_own=int(count)))
-        given = operands(disc, nums, cls.ids, cls.scheme, shared)
+        given = operands(disc, nums, cls, shared)
         parts.append(
             assembly.recoveries(
                 cls.scheme, disc.points, wide, cls.ids, far[cls.ids], given, right_sides(disc, nums, cls)
@@ -97,7 +133,7 @@ def _two_stage_rows(disc: Discretization, nums: Numbers, shared: Any) -> tuple[l
     reach = _reach(disc.stencils.indices, far)
     classes, rows = [], []
     for cls in disc.classes:
-        given = operands(disc, nums, cls.ids, cls.scheme, shared)
+        given = operands(disc, nums, cls, shared)
         reached = reach[cls.ids]
         rows.append(
             assembly.closed_rows(
@@ -177,7 +213,7 @@ def class_rows(disc: Discretization, nums: Numbers, cls: Class, shared: Any) -> 
     """The rows of one class of particles."""
 
     def one(cls: Class) -> Row:
-        given = operands(disc, nums, cls.ids, cls.scheme, shared)
+        given = operands(disc, nums, cls, shared)
         return assembly.rows(cls.scheme, disc.points, disc.kernel, cls.ids, cls.neighbours, given)
 
     return _joined(each("local fits", one, pieces(disc, nums, cls), _shared_out("rows", disc, cls)))
@@ -188,7 +224,7 @@ def class_coefficients(disc: Discretization, nums: Numbers, cls: Class, shared: 
     whole = (disc.images.extend_values(u), disc.images.extend_values(nums.gamma))
 
     def one(cls: Class) -> Any:
-        given = operands(disc, nums, cls.ids, cls.scheme, shared)
+        given = operands(disc, nums, cls, shared)
         return assembly.coefficients(
             cls.scheme, disc.points, disc.kernel, cls.ids, cls.neighbours, given, right_sides(disc, nums, cls), whole
         )

@@ -255,6 +255,8 @@ def skipped(disc: Discretization, linear: dict[str, Any], traced: bool) -> list[
         out.append("kernel derivatives")
     if disc.traced.constant and disc.rec.scale_free:
         out.append("recursion per particle")
+    elif disc.lengths:
+        out.append(f"recursion per particle, but for {disc.lengths} lengths")
     if disc.repeated:
         out.append(f"moment systems of {disc.repeated} particles with repeated stencils")
     if disc.traced.source == "zero":
