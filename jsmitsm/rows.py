@@ -16,7 +16,7 @@ from jsmitsm.assembly import Operands
 from jsmitsm.boundary import is_traced
 from jsmitsm.kernels import Kernel
 from jsmitsm.layout import Class, Discretization
-from jsmitsm.moments import Elimination, Row, Scheme
+from jsmitsm.moments import Elimination, Row
 from jsmitsm.neighbours import nearest, within
 from jsmitsm.numbers import Numbers
 from jsmitsm.progress import each, shown
@@ -48,7 +48,7 @@ def operands(disc: Discretization, nums: Numbers, cls: Class, shared: Eliminatio
 
 
 def _eliminations(disc: Discretization, nums: Numbers, cls: Class) -> tuple[Elimination, np.ndarray, np.ndarray] | None:
-    """A constant operator whose terms differ in order (laplacian(u) + k^2 u): one elimination for each of a few lengths.
+    """A constant operator of terms of different order (laplacian(u) + k^2 u): one elimination for each of a few lengths.
 
     Returns the eliminations (B, ...), their lengths (B,) and each particle's number (n,); None where that does not pay,
     and where something is traced.
