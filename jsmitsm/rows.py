@@ -48,7 +48,7 @@ def operands(disc: Discretization, nums: Numbers, cls: Class, shared: Eliminatio
 
 
 def _eliminations(disc: Discretization, nums: Numbers, cls: Class) -> tuple[Elimination, np.ndarray, np.ndarray] | None:
-    """A constant operator of terms of different order (laplacian(u) + k^2 u): one elimination for each of a few lengths.
+    """A constant operator of terms of several orders (laplacian(u) + k^2 u): one elimination for each of a few lengths.
 
     Returns the eliminations (B, ...), their lengths (B,) and each particle's number (n,); None where that does not pay,
     and where something is traced.

@@ -29,7 +29,7 @@ DENSE_MAX = 190
 # Unknowns from which multigrid was faster than LU, refined to round-off and with one adjoint solve.
 ITERATIVE_MIN = {2: 200_000, 3: 6_000}
 # Unknowns from which factors in float32, with refinement, were faster than those in float64.
-MIXED_MIN = 30_000
+MIXED_MIN = 15_000
 # Unknowns from which PARDISO on two cores was faster than either.
 PARDISO_MIN = {2: 200_000, 3: 2_000}
 BACKWARD_ERROR = 1e-9  # what is accepted of a direct solver
