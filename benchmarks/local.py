@@ -1,0 +1,78 @@
+"""The local phase, microseconds a particle: ``python -m benchmarks.local``.
+
+One small system for every particle: support, moments, weights, no neighbour search and no assembly. On one core and on
+all of them, for a constant operator, and for a variable one against its constant twin.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+import jsmitsm as js
+from benchmarks import machine
+from jsmitsm import discretize as dz
+from jsmitsm.solve import discretized
+
+DATA = Path(__file__).parent / "data" / "local.json"
+REPEATS = 9
+# Dimension, order, neighbours with the particle itself, particles along an axis.
+CASES = ((2, 4, 20, 150), (2, 6, 28, 150), (2, 8, 36, 150), (3, 2, 20, 28), (3, 4, 50, 28))
+
+
+def problem(dim: int, variable: bool) -> js.Problem:
+    conductivity = lambda x: 1.5 + jnp.sin(2 * x[0] + x[1])
+    source = lambda x: jnp.sin(x[0] + 2 * x[1])
+    if variable:
+        pde = lambda u, x: js.divergence(lambda y: conductivity(y) * js.grad(u)(y))(x) - source(x)
+    else:
+        pde = lambda u, x: js.laplacian(u)(x) - source(x)
+    sides = ("left", "right", "bottom", "top", "front", "back")[: 2 * dim]
+    return js.Problem(pde, dict.fromkeys(sides, js.dirichlet(0.0)))
+
+
+def microseconds(dim: int, order: int, size: int, side: int, variable: bool, cores: set[int]) -> float:
+    """The least of the repeats, for one particle."""
+    os.sched_setaffinity(0, cores)
+    make = js.rectangle if dim == 2 else js.box
+    cloud = make((0,) * dim, (1,) * dim, (side,) * dim, jitter=0.3)
+    posed = problem(dim, variable)
+    disc = discretized(posed, cloud, "S", order, None, js.stencils(cloud, size=size))
+    nums: Any = dz.numbers(disc, posed)
+    took = []
+    for _ in range(REPEATS):
+        start = time.perf_counter()
+        dz.all_rows(disc, nums)
+        took.append(time.perf_counter() - start)
+    return 1e6 * min(took) / len(disc.active)
+
+
+def main() -> None:
+    jax.config.update("jax_enable_x64", True)
+    about, rows = machine.describe(), []
+    every = os.sched_getaffinity(0)
+    for case in CASES:
+        one = microseconds(*case, False, {min(every)})
+        both = microseconds(*case, False, every)
+        variable = microseconds(*case, True, {min(every)})
+        dim, order, size, _ = case
+        cells = (f"{one:.3g}", f"{both:.3g}", f"{one / both:.2g}", f"{variable:.3g}", f"{variable / one:.2g}")
+        rows.append([f"{dim}D", str(order), str(size), *cells])
+        print(" | ".join(rows[-1]), flush=True)
+    note = (
+        f"Microseconds a particle, the least of {REPEATS} runs over some 20,000 particles, on {about['processor']} "
+        "(`python -m benchmarks.local`)."
+    )
+    columns = ["", "order", "neighbours", "one core", f"{about['cores']} cores", "gain", "variable coefficients", "ratio"]
+    made = {"columns": columns, "rows": rows, "note": note}
+    DATA.write_text(json.dumps({"machine": about, "tables": {"local": made}}, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
