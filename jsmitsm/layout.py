@@ -13,7 +13,7 @@ from jsmitsm.boundary import Group, group_conditions, is_traced
 from jsmitsm.clouds import Cloud
 from jsmitsm.kernels import EDGE, Constant, Gaussian, Kernel
 from jsmitsm.moments import Scheme
-from jsmitsm.neighbours import Stencils, evenly_spaced, in_line, nearest, replaced, within
+from jsmitsm.neighbours import Stencils, evenly_spaced, in_line, jumps, nearest, replaced, within
 from jsmitsm.periodic import Images, periodic_images
 from jsmitsm.problem import Problem
 from jsmitsm.recursion import Recursion, free_indices, recursion
@@ -332,10 +332,12 @@ def find_stencils(
             return in_line(points, min(default_size(scheme), len(points)), which)
         size = min(default_size(scheme, scheme.method == "S" and evenly_spaced(points)), len(points))
         found, full = nearest(points, size, which), min(default_size(scheme), len(points))
-        if cloud.dim < 3 or size == full or not len(conditioned):
+        if size == full:
             return found
-        # With small stencils a Neumann side in 3D has an error ten times that of the rest.
-        return replaced(found, conditioned, nearest(points, full, conditioned))
+        wide = jumps(found.radius, images.owners(found.indices))
+        if cloud.dim == 3:  # there a Neumann side with small stencils has an error ten times that of the rest
+            wide = np.union1d(wide, conditioned)
+        return replaced(found, wide, nearest(points, full, wide)) if len(wide) else found
     return within(points, np.asarray(kernel.d) * np.asarray(kernel.h), which)
 
 

@@ -22,6 +22,8 @@ _SAMPLE = 16
 # The nearest neighbour is farther than this part of the spacing around 90 % of the particles of an even cloud: 0.57 on
 # a lattice jittered by 0.3 spacings, 0.67 and more on relaxed clouds, 0.36 on Halton's points, 0.18 on random ones.
 _EVEN = 0.5
+# Around a particle the radii of stencils of one size differ by less than this ratio, but for jumps in the spacing.
+_JUMP = 2.2
 # Searches for fewer particles are done before a second core would have begun.
 _MANY = 4000
 
@@ -151,6 +153,15 @@ def evenly_spaced(points: np.ndarray) -> bool:
     volume = {1: 2.0, 2: np.pi, 3: 4.0 * np.pi / 3.0}[points.shape[1]]
     spacing = distance[:, -1] * (volume / (count + 1)) ** (1.0 / points.shape[1])
     return bool(np.quantile(distance[:, 1] / np.where(spacing > 0, spacing, 1.0), 0.1) > _EVEN)
+
+
+def jumps(radius: np.ndarray, neighbours: np.ndarray) -> np.ndarray:
+    """The particles around which the spacing changes abruptly: radius (N,) and neighbours (N, w), -1 for none.
+
+    The radius of as many neighbours doubles from inside to a corner; more is a jump.
+    """
+    there = radius[np.where(neighbours >= 0, neighbours, neighbours[:, :1])]
+    return np.flatnonzero((there.min(axis=1) < radius / _JUMP) | (there.max(axis=1) > radius * _JUMP))
 
 
 def _tree(points: np.ndarray) -> Any:

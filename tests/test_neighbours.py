@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import jsmitsm as js
+from jsmitsm import neighbours as room
 
 CLOUDS = [mm.jittered(1, 12), mm.jittered(2, 7), mm.jittered(3, 4)]
 
@@ -106,3 +107,43 @@ def test_stencils_are_a_pytree_and_print_briefly():
     leaves, shape = jax.tree.flatten(found)
     assert len(leaves) == 2 and np.array_equal(jax.tree.unflatten(shape, leaves).indices, found.indices)
     assert "49 particles" in repr(found) and len(repr(found)) < 100
+
+
+def stepped():
+    """Two lattices side by side, the right one four times finer."""
+    coarse = np.stack(np.meshgrid(np.arange(0.0, 1.0, 0.1), np.arange(0.0, 1.01, 0.1)), -1).reshape(-1, 2)
+    fine = np.stack(np.meshgrid(np.arange(1.0, 1.501, 0.025), np.arange(0.0, 1.01, 0.025)), -1).reshape(-1, 2)
+    return np.concatenate([coarse, fine])
+
+
+def test_a_jump_in_the_spacing_is_found_and_nothing_else():
+    lattice = np.stack(np.meshgrid(np.arange(20.0), np.arange(20.0)), -1).reshape(-1, 2)
+    near = room.nearest(lattice, 16)
+    assert not len(room.jumps(near.radius, near.indices))
+    points = stepped()
+    near = room.nearest(points, 16)
+    found = room.jumps(near.radius, near.indices)
+    assert len(found) and (abs(points[found, 0] - 1.0) < 0.4).all()
+    beside = np.flatnonzero(abs(points[:, 0] - 0.9) < 1e-9)
+    assert np.isin(beside, found).all()
+
+
+def test_even_clouds_have_smaller_stencils_except_at_jumps():
+    bcs = {"edge": js.dirichlet(0.0)}
+    problem = js.Problem(lambda u, x: js.laplacian(u)(x) + x[0], bcs)
+    size = lambda cloud: (js.solve(problem, cloud, order=6)._fit.neighbours >= 0).sum(axis=1)  # noqa: E731
+
+    def cloud(points):
+        edge = (points == points.min(axis=0)).any(axis=1) | (points == points.max(axis=0)).any(axis=1)
+        return js.Cloud(points, {"interior": np.flatnonzero(~edge), "edge": np.flatnonzero(edge)})
+
+    rng = np.random.default_rng(0)
+    points = stepped()
+    inner = ~np.isclose(points, points.min(axis=0)).any(axis=1) & ~np.isclose(points, points.max(axis=0)).any(axis=1)
+    points[inner] += rng.uniform(-0.1, 0.1, (inner.sum(), 2)) * np.where(points[inner, :1] < 1.0, 0.1, 0.025)
+    counts = size(cloud(points))
+    assert np.median(counts) == 22 and np.median(counts[abs(points[:, 0] - 0.9) < 0.02]) >= 28
+    random = rng.random((400, 2))
+    random[:80] = np.concatenate([np.stack([t, o], 1) for t in [np.linspace(0, 1, 20)] for o in (0 * t, 0 * t + 1)] +
+                                 [np.stack([o, t], 1) for t in [np.linspace(0, 1, 22)[1:-1]] for o in (0 * t, 0 * t + 1)])
+    assert np.median(size(cloud(random))) >= 28
