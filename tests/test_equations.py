@@ -1,4 +1,4 @@
-"""Equations of every kind against the ceilings of the benchmark's table.
+"""Equations of every kind against the bounds of the table of problems.
 
 A quick part of ``python -m benchmarks.equations``: the default kernel and stencils, clouds and
 solutions that nothing was tuned on. Each line asserts the error, further errors (pressure, stress
@@ -10,7 +10,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.equations import EQUATIONS, estimated, missed, run, shown
+from benchmarks.equations import estimated, good, missed, run, shown
+from benchmarks.problems import CASES
 
 LINEAR = [
     ("diffusion", 4), ("diffusion", 8), ("anisotropy", 4), ("rotated", 6), ("helmholtz", 6), ("heat", 4),
@@ -25,12 +26,12 @@ SYSTEMS = [
 
 @pytest.mark.parametrize(("name", "order"), [*LINEAR, *SHAPES, *NONLINEAR, *SYSTEMS])
 def test_error_is_below_its_ceiling(name, order):
-    line = run(replace(EQUATIONS[name], coarse=None), order, estimate=False)
+    line = run(replace(CASES[name], coarse=None), order, estimate=False)
     assert not missed(line), shown(line)
 
 
 def test_newton_keeps_the_order():
-    line = run(EQUATIONS["bratu 2D"], 4, estimate=False)
+    line = run(CASES["bratu 2D"], 4, estimate=False)
     assert not missed(line), shown(line)
     assert line["rate"] > 3.5
 
@@ -38,20 +39,18 @@ def test_newton_keeps_the_order():
 @pytest.mark.parametrize(("name", "form"), [("heat", "lsq"), ("diffusion", "loo"), ("wave", "lsq"), ("u_xy", "lsq")])
 def test_global_form_follows_the_operator(name, form):
     """Where information travels, in time too, least squares; elliptic equations, leave-one-out."""
-    assert EQUATIONS[name].solve(4 if name != "wave" else 6).stats["formulation"] == form
+    assert CASES[name].solve(4 if name != "wave" else 6).stats["formulation"] == form
 
 
 @pytest.mark.parametrize("name", ["anisotropy", "heat"])
 def test_error_estimate_knows_size_and_place(name):
-    case = EQUATIONS[name]
-    found = estimated(case, case.solve(4))
-    assert 0.2 < found["effectivity"] < 5
-    assert found["rank"] > 0.75
+    case = CASES[name]
+    assert good(estimated(case, case.solve(4)))
 
 
 def test_a_wrong_solution_misses():
     """The measure itself: an error of 1e-4 in one of two fields is seen, a constant in a floating field is not."""
-    case = EQUATIONS["stokes"]
+    case = CASES["stokes"]
     cloud = case.cloud()
     true = case.values(cloud.points)
 
