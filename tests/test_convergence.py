@@ -27,12 +27,12 @@ SEEDS = {(1, "dirichlet"): 8, (1, "neumann"): 4, (2, "dirichlet"): 4, (2, "neuma
 
 
 def solve(order, kind, cloud):
-    case = CASES[f"poisson {cloud.dim}D"]
+    case = CASES[f"plain {cloud.dim}D"]
     return js.solve(case.problem(**mm.conditions(cloud.dim, case.exact, kind)), cloud, order=order)
 
 
 def relative_l2(sol):
-    return CASES[f"poisson {sol.cloud.dim}D"].error(sol)
+    return CASES[f"plain {sol.cloud.dim}D"].error(sol)
 
 
 def typical_error(dim, n, order, kind):
@@ -68,7 +68,7 @@ def test_a_thousand_scattered_particles_at_order_six():
 def test_the_polynomials_converge_between_particles():
     """sol(points) and sol.grad(points) at order 4 away from particles: orders 4 and 3, loosely."""
     points = np.random.default_rng(0).uniform(0.1, 0.9, (200, 2))
-    exact = CASES["poisson 2D"].exact
+    exact = CASES["plain 2D"].exact
     true = mm.values(exact, points)
     slopes = np.array([np.asarray(js.grad(exact)(x)) for x in points])
     errors = []

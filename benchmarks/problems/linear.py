@@ -110,6 +110,12 @@ def _every_term(u: Any, x: Any) -> Any:
     return diffusion(a)(u, x) + convected - jnp.exp(x[-1]) * u(x)
 
 
+def _plain(x: Any) -> Any:
+    """Smooth, without symmetry, no polynomial, the same size everywhere."""
+    value = jnp.exp(x[0]) * jnp.sin(2.0 * x[-1] + 0.4)
+    return value if len(x) < 3 else value + jnp.cos(x[0] + 2.0 * x[1])
+
+
 def _skew_wave(x: Any) -> Any:
     return jnp.sin(2 * x[0] + x[1])
 
@@ -142,9 +148,10 @@ _JITTERED = {1: {4: 4e-7}, 2: {4: 1e-7}, 3: {4: 2e-5}}
 
 ON_LATTICES = (
     *(
-        on_box(f"{name} {d}D", about, operator, curved, *_UNIT[d], _SHAPE[d], 0.3, ceilings=_JITTERED[d])
-        for name, about, operator in (
-            ("poisson", "laplacian(u) = f", laplace), ("every term", "div(a grad u) + b u_x - c u = f", _every_term)
+        on_box(f"{name} {d}D", about, operator, exact, *_UNIT[d], _SHAPE[d], 0.3, ceilings=_JITTERED[d])
+        for name, about, operator, exact in (
+            ("poisson", "laplacian(u) = f", laplace, curved), ("plain", "laplacian(u) = f, u plain", laplace, _plain),
+            ("every term", "div(a grad u) + b u_x - c u = f", _every_term, curved),
         )
         for d in (1, 2, 3)
     ),
