@@ -135,8 +135,8 @@ def _refuse_too_many(counts: dict[str, int], total: int, fields: int) -> None:
     for name, count in counts.items():
         if count > most:
             raise ValueError(
-                f"bcs[{name!r}]: {count} conditions on one side, but an operator of order {total} takes at most {most}; "
-                "remove some"
+                f"bcs[{name!r}]: {count} conditions on one side, but an operator of order {total} takes at most "
+                f"{most}; remove some"
             )
         if fields == 1 and 2 * count > total and 2 * min(counts.values()) >= total and total % 2 == 0:
             raise ValueError(
