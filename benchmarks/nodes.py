@@ -58,7 +58,8 @@ def main() -> None:
             separation, fill = quality(points)
             rows.append([name, str(len(points)), f"{seconds:.2f}", f"{separation:.2f}", f"{fill:.2f}",
                          f"{fill / separation:.2f}"])  # fmt: skip
-            print(" ".join(f"{cell:>17}" for cell in rows[-1]), flush=True)
+            slow = make is made and seconds > AMOEBA.seconds.get(n, np.inf)
+            print(" ".join(f"{cell:>17}" for cell in rows[-1]) + (" MISSED seconds" if slow else ""), flush=True)
     about = machine.describe()
     note = f"The amoeba in 2D on {about['cores']} cores of {about['processor']} (`python -m benchmarks.nodes`)."
     tables = {"nodes": {"columns": COLUMNS, "rows": rows, "note": note}}

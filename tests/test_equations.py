@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import jsmitsm as js
 from benchmarks.equations import estimated, good, missed, run, shown
 from benchmarks.problems import CASES
 
@@ -17,7 +18,8 @@ LINEAR = [
     ("diffusion", 4), ("diffusion", 8), ("anisotropy", 4), ("rotated", 6), ("helmholtz", 6), ("heat", 4),
     ("convection", 4), ("wave", 6), ("u_xy", 6), ("biharmonic", 4),
 ]  # fmt: skip
-SHAPES = [("star", 4), ("star mixed", 4), ("star neumann", 4), ("ball", 4), ("step", 4), ("step", 8), ("cluster", 6)]
+SHAPES = [("star", 4), ("star mixed", 4), ("star neumann", 4), ("ball", 4), ("step", 4), ("step", 8), ("cluster", 6),
+          ("amoeba", 4)]  # fmt: skip
 NONLINEAR = [("bratu 1D", 8), ("quasilinear", 4), ("burgers", 4)]
 SYSTEMS = [
     ("elasticity", 4), ("kirsch", 6), ("cantilever", 4), ("stokes", 6), ("reaction-diffusion", 4), ("elasticity 3D", 4)
@@ -46,6 +48,13 @@ def test_global_form_follows_the_operator(name, form):
 def test_error_estimate_knows_size_and_place(name):
     case = CASES[name]
     assert good(estimated(case, case.solve(4)))
+
+
+def test_nearest_neighbours_alone_blow_up_where_the_density_jumps():
+    case = CASES["step"]
+    cloud = case.cloud()
+    plain = js.solve(case.problem(), cloud, stencils=js.stencils(cloud, size=20), throw=False)
+    assert not case.error(plain) < 100 * case.ceilings[4]
 
 
 def test_a_wrong_solution_misses():

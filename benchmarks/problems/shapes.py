@@ -34,6 +34,10 @@ def _in_3d(x):
     return jnp.exp(0.5 * x[0]) * jnp.sin(x[1] + 0.3) * jnp.cos(x[2])
 
 
+def conducting(x):
+    return 1.5 + jnp.sin(2 * x[0] + x[1])
+
+
 def _on_plate(x):
     return jnp.exp(x[0] / 2) * jnp.sin(2 * x[1]) + x[0] * x[1]
 
@@ -97,8 +101,8 @@ SHAPES = table(
         ("boundary",), ceilings={4: 1e-7}, further=PARTICLES, seconds={5000: 0.5, 100_000: 10.0}, estimates=(4,),
     ),
     Case(
-        "conducting amoeba", "div((1.5 + sin(2x + y)) grad u) = f", diffusion(lambda x: 1.5 + jnp.sin(2 * x[0] + x[1])),
-        curved, scenes.amoeba, ("boundary",), ceilings={4: 1e-7},
+        "conducting amoeba", "div((1.5 + sin(2x + y)) grad u) = f", diffusion(conducting), curved,
+        scenes.amoeba, ("boundary",), ceilings={4: 1e-7},
     ),
     Case("smooth ball", "laplacian(u) = f in 3D, u smoother than in the ball", laplace, _in_3d, scenes.ball, ("sphere",),
          ceilings={4: 1e-6}),
