@@ -22,7 +22,6 @@ import numpy as np
 
 if "--float32" not in sys.argv:
     jax.config.update("jax_enable_x64", True)
-import jax.numpy as jnp
 
 import jsmitsm as js
 from benchmarks import scenes

@@ -50,11 +50,14 @@ def test_error_estimate_knows_size_and_place(name):
     assert good(estimated(case, case.solve(4)))
 
 
-def test_nearest_neighbours_alone_blow_up_where_the_density_jumps():
-    case = CASES["step"]
+@pytest.mark.parametrize("name", ["step", "cluster"])
+def test_nearest_neighbours_alone_fail_where_the_density_jumps(name):
+    """The ceilings of these clouds ask for the repair of weak stencils."""
+    case = CASES[name]
     cloud = case.cloud()
-    plain = js.solve(case.problem(), cloud, stencils=js.stencils(cloud, size=20), throw=False)
-    assert not case.error(plain) < 100 * case.ceilings[4]
+    plain = case.solve(6, cloud, stencils=js.stencils(cloud, size=28), throw=False)
+    assert plain.stats["lebesgue_max"] > 100
+    assert not case.error(plain) < case.ceilings[6]
 
 
 def test_a_wrong_solution_misses():
