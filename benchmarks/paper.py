@@ -26,7 +26,7 @@ import numpy as np
 
 import jsmitsm as js
 from benchmarks import machine, problems, published
-from benchmarks.problems import PAPER, Case
+from benchmarks.problems import CASES, Case
 
 HERE = Path(__file__).parent
 METHODS = ("I", "II", "III", "SSPH", "S")
@@ -126,13 +126,13 @@ def compiled_fast() -> Iterator[None]:
 def rod_job(terms: int, method: str, nodes: int) -> Job:
     """An entry of Tables 1 to 4; the paper counts Taylor terms."""
     d = published.SSPH_SUPPORT[terms] if method == "SSPH" else 2.0
-    return Job(PAPER["rod"], nodes, method, terms - 1, d)
+    return Job(CASES["rod"], nodes, method, terms - 1, d)
 
 
 def plate_job(row: tuple[str, str, int, int | None], grid: tuple[int, int]) -> Job:
     """An entry of Table 5; its six terms are free coefficients for I, II and III."""
     _, method, order, basis_terms = row
-    return Job(PAPER["plate"], grid, method, order, 4.0, basis_terms=basis_terms)
+    return Job(CASES["plate"], grid, method, order, 4.0, basis_terms=basis_terms)
 
 
 def entries(keys: Iterable[Any], make: Callable[..., Job], paper: Callable[..., float | None]) -> list[dict[str, Any]]:
@@ -224,10 +224,10 @@ def temperatures(plate: list[dict[str, Any]]) -> dict[str, Any]:
     """Temperatures along x = 2, from the solutions of Table 5."""
     lines = {}
     for grid in published.GRIDS:
-        points = np.asarray(PAPER["plate"].cloud(grid).points)
+        points = np.asarray(CASES["plate"].cloud(grid).points)
         on = np.flatnonzero(np.abs(points[:, 0] - 2.0) < 1e-9)
         on = on[np.argsort(points[on, 1])]
-        line = {"y": points[on, 1], "exact": PAPER["plate"].values(points[on])}
+        line = {"y": points[on, 1], "exact": CASES["plate"].values(points[on])}
         for e in plate:
             if e["key"][1] == grid and e["u"] is not None and e["key"][0][3] != 7:
                 line[e["key"][0][0]] = e["u"][on]
@@ -253,7 +253,7 @@ def sweep_jobs(grid: tuple[int, int], method: str) -> dict[str, list[tuple[float
     reach = 5.0 if heavy else 4.0 * max(LENGTHS)
 
     def job(h, d):
-        return Job(PAPER["source"], grid, method, 2, d, h, reach=reach if h * d <= reach else None)
+        return Job(CASES["source"], grid, method, 2, d, h, reach=reach if h * d <= reach else None)
 
     lengths = FEW_LENGTHS if heavy else LENGTHS
     return {"d": [(d, job(1.0, d)) for d in RADII], "h": [(h, job(h, 4.0)) for h in lengths]}
@@ -347,12 +347,12 @@ def families() -> dict[str, Callable[[float], Case]]:
     """Sources by the shift of their singularity; widths of peaks are 1 and 3 spacings of the clouds used."""
     at = 0.4472
     return {
-        "smooth 1D": lambda s: problems.GENERIC["poisson 1D"],
+        "smooth 1D": lambda s: CASES["poisson 1D"],
         "kink 1D": lambda s: problems.kink_1d(at + s),
         "jump 1D": lambda s: problems.jump_1d(at + s),
         "peak 1D, narrow": lambda s: problems.peak_1d(at + s, width=1 / 40),
         "peak 1D, wide": lambda s: problems.peak_1d(at + s, width=3 / 40),
-        "smooth 2D": lambda s: problems.GENERIC["poisson 2D"],
+        "smooth 2D": lambda s: CASES["poisson 2D"],
         "kink 2D": lambda s: problems.kink_2d(0.8 + s),
         "jump 2D": lambda s: problems.jump_2d(0.3 + s),
         "peak 2D, narrow": lambda s: problems.peak_2d((at + s, 0.5345), width=1 / 24),
@@ -367,7 +367,7 @@ def nonsmooth() -> list[dict[str, Any]]:
 
     def measure(task):
         row, method = task
-        dim = made[row["source"]](0.0).dim
+        dim = 1 if "1D" in row["source"] else 2
         shape = 41 if dim == 1 else 25
         found = [run(Job(made[row["source"]](s), shape, method, row["order"], 4.0)).percent for s in SHIFTS[dim]]
         return math.nan if None in found else float(np.sqrt(np.mean(np.square(found))))

@@ -14,7 +14,7 @@ import math
 import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +24,8 @@ import numpy as np
 
 import jsmitsm as js
 from benchmarks import machine, peers
-from benchmarks.problems import PAPER
-from benchmarks.scenes import ball
+from benchmarks.problems import CASES, Case
+from benchmarks.problems.shapes import conducting
 from jsmitsm.simplices import simplices
 
 DATA = Path(__file__).parent / "data" / "pareto.json"
@@ -37,81 +37,61 @@ PATIENCE = 4.0
 
 @dataclass(frozen=True)
 class Scene:
-    """div(k grad u) = f with a known solution, on clouds of growing size.
+    """A case div(k grad u) = f of the table, on clouds of growing size.
 
-    ours, others : sizes to run; lattice : whether sizes are those of a lattice (nx, ny).
+    sizes : arguments of ``cloud``; lattice : whether they are those of a lattice (nx, ny).
     """
 
     name: str
     about: str
-    cloud: Callable[[Any], js.Cloud]
-    exact: Callable[[Any], Any]
+    case: Case
     conductivity: Callable[[Any], Any]
     sizes: tuple[Any, ...]
     orders: tuple[int, ...]
-    boundary: tuple[str, ...] = ("boundary",)
-    slope: str | None = None
+    cloud: Callable[[Any], js.Cloud]
     lattice: bool = False
 
-    def operator(self, u: Callable, x: Any) -> Any:
-        if self.conductivity is one:
-            return js.laplacian(u)(x)
-        return js.divergence(lambda y: self.conductivity(y) * js.grad(u)(y))(x)
+    @property
+    def exact(self) -> Callable[[Any], Any]:
+        return self.case.exact
+
+    @property
+    def slope(self) -> str | None:
+        """The group with a Neumann condition."""
+        return next(iter(self.case.bcs), None)
+
+    @property
+    def boundary(self) -> tuple[str, ...]:
+        return tuple(name for name in self.case.sides if name != self.slope)
 
     def problem(self) -> js.Problem:
         """Written anew for every call, as in a script."""
-        exact, conductivity = self.exact, self.conductivity
-        if conductivity is one:
-            pde = lambda u, x: js.laplacian(u)(x) - js.laplacian(exact)(x)
-        else:
-            flux = lambda u: lambda y: conductivity(y) * js.grad(u)(y)
-            pde = lambda u, x: js.divergence(flux(u))(x) - js.divergence(flux(exact))(x)
-        bcs = {name: js.dirichlet(exact) for name in self.boundary}
-        return js.Problem(pde, bcs | ({self.slope: js.neumann(0.0)} if self.slope else {}))
+        return self.case.problem()
 
 
 def one(x: Any) -> float:
     return 1.0
 
 
-def _amoeba(spacing: float) -> js.Cloud:
-    shape = lambda x: jnp.sqrt(x[0] ** 2 + x[1] ** 2 + 1e-300) - 1 - 0.2 * jnp.cos(5 * jnp.arctan2(x[1], x[0]))
-    return js.from_sdf(shape, ((-1.3, -1.3), (1.3, 1.3)), spacing)
-
-
-def _curved(x):
-    return jnp.exp(x[0]) * jnp.sin(2 * x[1]) + x[0] ** 3 * x[1]
-
-
-def _conducting(x):
-    return 1.5 + jnp.sin(2 * x[0] + x[1])
-
-
-def _wave(x):
-    return jnp.sin(x[0]) * jnp.cos(x[1])
-
-
-def _in_3d(x):
-    return jnp.exp(0.5 * x[0]) * jnp.sin(x[1] + 0.3) * jnp.cos(x[2])
-
-
-def _lattice(shape):
-    return PAPER["source"].cloud(shape)
+def _ball(n: int) -> js.Cloud:
+    return CASES["smooth ball"].cloud(n, round(1.6 * n ** (2 / 3) * 3.6))
 
 
 SPACINGS = (0.13, 0.1, 0.08, 0.06, 0.042, 0.028, 0.02, 0.0137, 0.0092, 0.0061)
 LATTICES = ((9, 19), (17, 37), (25, 55), (33, 73), (49, 109), (65, 145), (129, 289), (257, 577))
+AMOEBA, CONDUCTOR = CASES["amoeba"], CASES["conducting amoeba"]
+# Its source by AD as in the others.
+LATTICE = replace(CASES["source"], source=None)
 SCENES = {
     scene.name: scene
     for scene in (
-        Scene("amoeba", "Poisson, scattered particles", _amoeba, _curved, one, SPACINGS, (2, 4, 6, 8, 10)),
-        Scene("lattice", "problem 4.3 of the paper, a Neumann side", _lattice, _wave, one, LATTICES, (2, 4, 6, 8, 10),
-              ("left", "right", "top"), "bottom", True),
-        Scene("ball", "Poisson in 3D, uniformly random particles",
-              lambda n: ball(n, round(1.6 * n ** (2 / 3) * 3.6)), _in_3d, one,
-              (500, 1000, 2000, 4000, 8000, 16000, 32000), (2, 4, 6), ("sphere",)),
-        Scene("conductor", "div(k grad u) = f, k variable, scattered particles", _amoeba, _curved, _conducting,
-              SPACINGS, (2, 4, 6, 8, 10)),
+        Scene("amoeba", "Poisson, scattered particles", AMOEBA, one, SPACINGS, (2, 4, 6, 8, 10), AMOEBA.cloud),
+        Scene("lattice", "problem 4.3 of the paper, a Neumann side", LATTICE, one, LATTICES, (2, 4, 6, 8, 10),
+              LATTICE.cloud, lattice=True),
+        Scene("ball", "Poisson in 3D, uniformly random particles", CASES["smooth ball"], one,
+              (500, 1000, 2000, 4000, 8000, 16000, 32000), (2, 4, 6), _ball),
+        Scene("conductor", "div(k grad u) = f, k variable, scattered particles", CONDUCTOR, conducting, SPACINGS,
+              (2, 4, 6, 8, 10), CONDUCTOR.cloud),
     )
 }  # fmt: skip
 
@@ -124,7 +104,7 @@ def posed(scene: Scene, cloud: js.Cloud, size: Any) -> peers.Posed:
 
     def functions(places):
         places = jnp.asarray(places)
-        source = jax.vmap(lambda x: scene.operator(scene.exact, x))(places)
+        source = jax.vmap(lambda x: scene.case.operator(scene.exact, x))(places)
         return tuple(np.array(v) for v in (source, _everywhere(scene.conductivity, places), jax.vmap(scene.exact)(places)))
 
     points = np.asarray(cloud.points)

@@ -4,49 +4,25 @@ import argparse
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import matplotlib
 import numpy as np
 
 import jsmitsm as js
 import jsmitsm.plot
 import jsmitsm.sdf
+from benchmarks.problems import CASES
 
 matplotlib.use("Agg")
 jax.config.update("jax_enable_x64", True)
 IMAGES = Path(__file__).parent.parent / "docs" / "images"
 
 
-def plate(spacing):
-    """A plate with two holes; groups outer, hot, cold."""
-    shape = js.sdf.difference(
-        js.sdf.rectangle((0.0, 0.0), (3.0, 2.0)), js.sdf.circle((0.9, 1.2), 0.35), js.sdf.circle((2.1, 0.7), 0.45)
-    )
-
-    def near(x, centre, radius):
-        return np.abs(np.linalg.norm(x - np.array(centre), axis=1) - radius) < 1e-6
-
-    groups = {
-        "hot": lambda x: near(x, (0.9, 1.2), 0.35),
-        "cold": lambda x: near(x, (2.1, 0.7), 0.45),
-        "outer": lambda x: x[:, 0] > -1,
-    }
-    return js.from_sdf(shape, ((0.0, 0.0), (3.0, 2.0)), spacing, groups=groups)
-
-
-def manufactured(x):
-    """A smooth function; the problem it solves is made from it by AD."""
-    return jnp.exp(x[0] / 2) * jnp.sin(2 * x[1]) + x[0] * x[1]
+PLATE = CASES["two holes"]
 
 
 def relative_error(cloud, order):
-    """Relative L2 error of method S for Poisson's equation with the manufactured solution."""
-    problem = js.Problem(
-        lambda u, x: js.laplacian(u)(x) - js.laplacian(manufactured)(x),
-        {name: js.dirichlet(manufactured) for name in ("outer", "hot", "cold")},
-    )
-    exact = np.asarray(jax.vmap(manufactured)(cloud.points))
-    return float(np.linalg.norm(js.solve(problem, cloud, order=order).u - exact) / np.linalg.norm(exact))
+    """Relative L2 error of method S for Poisson's equation on the plate."""
+    return PLATE.error(PLATE.solve(order, cloud))
 
 
 def first(plt):
@@ -56,7 +32,7 @@ def first(plt):
         lambda u, x: js.laplacian(u)(x),
         {"hot": js.dirichlet(100.0), "cold": js.dirichlet(0.0), "outer": js.neumann(0.0)},
     )
-    cloud = plate(0.09)
+    cloud = PLATE.cloud(0.09)
     sol = js.solve(heat, cloud, order=4)
     middle = int(np.argmin(np.linalg.norm(cloud.points - np.array([1.6, 1.45]), axis=1)))
     js.plot.cloud(sol, support=middle, ax=axes[0], legend=False)
@@ -64,7 +40,7 @@ def first(plt):
     js.plot.solution(sol, ax=axes[1])
     axes[1].set_title("a temperature: hot hole, cold hole, insulated rim")
     spacings = [0.2, 0.14, 0.1, 0.07]
-    clouds = [plate(h) for h in spacings]
+    clouds = [PLATE.cloud(h) for h in spacings]
     errors = {f"degree {p}": [relative_error(c, p) for c in clouds] for p in (2, 4, 6, 8)}
     js.plot.convergence(spacings, errors, ylabel="relative error", ax=axes[2])
     axes[2].set_title("method S, a smooth solution on this plate")
@@ -84,11 +60,9 @@ def slices(plt):
 
 def errors(plt):
     """The true error beside the estimate that knows no exact solution."""
-    cloud = plate(0.1)
-    bcs = {name: js.dirichlet(manufactured) for name in ("outer", "hot", "cold")}
-    sol = js.solve(js.Problem(lambda u, x: js.laplacian(u)(x) - js.laplacian(manufactured)(x), bcs), cloud, order=3)
+    sol = PLATE.solve(3, PLATE.cloud(0.1))
     fig, (left, right) = plt.subplots(1, 2, figsize=(10, 3.2), layout="constrained")
-    js.plot.error(sol, manufactured, ax=left)
+    js.plot.error(sol, PLATE.exact, ax=left)
     js.plot.estimate(sol, ax=right)
     return fig
 

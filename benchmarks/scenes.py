@@ -1,4 +1,4 @@
-"""Clouds of the table of equations: scattered squares, density jumps, a star, a plate with a hole, a ball."""
+"""Clouds of the table of problems: lattices, scattered squares, density jumps, stars, plates with holes, balls."""
 
 from __future__ import annotations
 
@@ -10,7 +10,29 @@ import numpy as np
 
 import jsmitsm as js
 
-SIDES = {"left": (-1.0, 0.0), "right": (1.0, 0.0), "bottom": (0.0, -1.0), "top": (0.0, 1.0)}
+NORMALS = {"left": (-1.0, 0.0), "right": (1.0, 0.0), "bottom": (0.0, -1.0), "top": (0.0, 1.0)}
+
+
+def lattice(lo: tuple, hi: tuple, shape: Any, jitter: float = 0.0, seed: int = 0) -> Callable[..., js.Cloud]:
+    """What makes lattices of one box: of ``shape`` particles (a number is the same along every axis).
+
+    ``jitter`` moves interior particles by up to that part of the spacing, on a line too.
+    """
+    dim = len(lo)
+
+    def cloud(shape: Any = shape, jitter: float = jitter, seed: int = seed) -> js.Cloud:
+        shape = (shape,) * dim if np.ndim(shape) == 0 else shape
+        if dim > 1:
+            return (js.rectangle if dim == 2 else js.box)(lo, hi, shape, jitter=jitter, seed=seed)
+        made = js.interval(lo[0], hi[0], shape[0])
+        if not jitter:
+            return made
+        points, inside = np.array(made.points), made.groups["interior"]
+        move = np.random.default_rng(seed).uniform(-1, 1, (len(inside), 1))
+        points[inside] += jitter * (hi[0] - lo[0]) / (shape[0] - 1) * move
+        return js.Cloud(points, made.groups, made.normals)
+
+    return cloud
 
 
 def halton(n: int, seed: int) -> np.ndarray:
@@ -36,7 +58,7 @@ def sided(inside: np.ndarray, x: np.ndarray, left: np.ndarray, right: np.ndarray
     groups = {name: np.arange(i, j) for name, i, j in zip(parts, ends[:-1], ends[1:])}
     points = np.concatenate(list(parts.values()))
     normals = np.full(points.shape, np.nan)
-    for name, normal in SIDES.items():
+    for name, normal in NORMALS.items():
         normals[groups[name]] = normal
     return js.Cloud(points, groups, normals)
 
@@ -98,6 +120,32 @@ def star(spacing: float = 0.0285, groups: Mapping[str, Callable] | None = None, 
 
 
 STAR_PARTS = {"lower": lambda x: x[:, 1] < -0.2, "upper": lambda x: x[:, 1] >= -0.2}
+
+
+def amoeba(spacing: float = 0.027) -> js.Cloud:
+    """The amoeba r < 1 + 0.2 cos 5t; about 5000 particles at the spacing 0.027."""
+    return js.from_sdf(amoeba_level, ((-1.3, -1.3), (1.3, 1.3)), spacing)
+
+
+def amoeba_level(x: Any) -> Any:
+    return jnp.sqrt(x[0] ** 2 + x[1] ** 2 + 1e-300) - 1 - 0.2 * jnp.cos(5 * jnp.arctan2(x[1], x[0]))
+
+
+def two_holes(spacing: float = 0.1) -> js.Cloud:
+    """A plate with two holes; groups outer, hot, cold."""
+    shape = js.sdf.difference(
+        js.sdf.rectangle((0.0, 0.0), (3.0, 2.0)), js.sdf.circle((0.9, 1.2), 0.35), js.sdf.circle((2.1, 0.7), 0.45)
+    )
+
+    def near(x, centre, radius):
+        return np.abs(np.linalg.norm(x - np.array(centre), axis=1) - radius) < 1e-6
+
+    groups = {
+        "hot": lambda x: near(x, (0.9, 1.2), 0.35),
+        "cold": lambda x: near(x, (2.1, 0.7), 0.45),
+        "outer": lambda x: x[:, 0] > -1,
+    }
+    return js.from_sdf(shape, ((0.0, 0.0), (3.0, 2.0)), spacing, groups=groups)
 
 
 def holed_plate(half: float = 3.0, near: float = 0.05, growth: float = 0.15, seed: int = 4) -> js.Cloud:

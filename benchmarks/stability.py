@@ -22,10 +22,11 @@ import numpy as np
 
 if "--float32" not in sys.argv:
     jax.config.update("jax_enable_x64", True)
-import jax.numpy as jnp
 
 import jsmitsm as js
+from benchmarks import scenes
 from benchmarks.machine import describe
+from benchmarks.problems.families import FAMILIES, at_home
 from jsmitsm.neighbours import Stencils
 
 DATA = Path(__file__).parent / "data" / "stability.json"
@@ -52,94 +53,12 @@ ORDERS = {
 }  # fmt: skip
 SIDE = {1: 41, 2: 15, 3: 7}  # particles along an edge: one array shape per dimension
 WIDTH = {1: 13, 2: 81, 3: 203}  # of the stencils that a kernel's support selects from
-SIDES = ("left", "right", "bottom", "top", "front", "back")
 # Messages that tell what was done, not that something is wrong.
 NEUTRAL = ("widened or balanced", "its mean over the particles")
 
 
-# ------------------------------------------------------------------ problems
-# Every exact solution is f(x, q, xp): coordinates first, q the parameters, xp numpy or jax.numpy.
-
-
-def smooth(x, q, xp=jnp):
-    """A smooth function of the coordinates in units of the domain."""
-    s = [(x[i] - q["at"][i]) / q["size"] for i in range(len(x))]
-    rest = sum(s[1:]) if len(s) > 1 else 0.0
-    return xp.exp(s[0]) * xp.sin(2.0 * s[-1] + 0.3) + rest
-
-
-def peak(x, q, xp=jnp):
-    square = sum((x[i] - q["centre"][i]) ** 2 for i in range(len(x)))
-    return xp.exp(-square / q["w"] ** 2) + 1.0 + x[0]
-
-
-def reaction(x, q, xp=jnp):
-    return (xp.exp(-x[0] / q["eps"]) + xp.exp(-(1.0 - x[0]) / q["eps"])) / (1.0 + xp.exp(-1.0 / q["eps"]))
-
-
-def swept(x, q, xp=jnp):
-    """The outflow layer of -eps u'' + u' = 0, u(0) = 0, u(1) = 1."""
-    return (xp.exp((x[0] - 1.0) / q["eps"]) - xp.exp(-1.0 / q["eps"])) / (1.0 - xp.exp(-1.0 / q["eps"]))
-
-
-def wave(x, q, xp=jnp):
-    return xp.sin(q["k"] * (0.8 * x[0] + 0.6 * x[1] if len(x) > 1 else x[0]) + 0.3)
-
-
-def jump(x, q, xp=jnp):
-    """Harmonic, with boundary values that jump from 1 to 0 at (x0, 0)."""
-    return xp.arctan2(x[1], x[0] - q["x0"]) / np.pi
-
-
-def poisson(exact):
-    return lambda u, x, q: js.laplacian(u)(x) - js.laplacian(lambda y: exact(y, q))(x)
-
-
-def laplace(u, x, q):
-    return js.laplacian(u)(x)
-
-
-def damped(u, x, q):
-    return q["eps"] ** 2 * js.laplacian(u)(x) - u(x)
-
-
-def helmholtz(exact, source):
-    def pde(u, x, q):
-        own = js.laplacian(u)(x) + q["k"] ** 2 * u(x)
-        return own - js.laplacian(lambda y: exact(y, q))(x) - q["k"] ** 2 * exact(x, q) if source else own
-
-    return pde
-
-
-def convected(exact):
-    def pde(u, x, q):
-        axis = (1,) + (0,) * (len(x) - 1)
-        own = js.partial(u, axis)(x) - q["eps"] * js.laplacian(u)(x)
-        if exact is None:
-            return own
-        known = lambda y: exact(y, q)
-        return own - js.partial(known, axis)(x) + q["eps"] * js.laplacian(known)(x)
-
-    return pde
-
-
-PDES = {
-    "poisson": (poisson(smooth), smooth), "peak": (poisson(peak), peak), "reaction": (damped, reaction),
-    "layer": (convected(None), swept), "carried": (convected(smooth), smooth), "jump": (laplace, jump),
-    "resonance": (helmholtz(smooth, True), smooth), "wave": (helmholtz(wave, False), wave),
-}  # fmt: skip
-
-
 def problem(name, dim, q, neumann=False):
-    pde, exact = PDES[name]
-    bcs = {side: js.dirichlet(exact) for side in SIDES[: 2 * dim]}
-    if neumann:
-        bcs["left"] = js.neumann(lambda x, q: -js.grad(lambda y: exact(y, q))(x)[0])
-    return js.Problem(pde, bcs, params=q)
-
-
-def at_home(dim):
-    return {"at": np.zeros(dim), "size": 1.0}
+    return FAMILIES[name].problem(dim, q, neumann)
 
 
 # ------------------------------------------------------------------ clouds
@@ -148,17 +67,7 @@ def at_home(dim):
 def lattice(dim, jitter=0.0, seed=0, lo=None, size=1.0, shape=None):
     """A jittered lattice on a box; in 1D too."""
     lo = np.zeros(dim) if lo is None else lo
-    hi = lo + size
-    shape = (SIDE[dim],) * dim if shape is None else shape
-    if dim == 1:
-        made = js.interval(lo[0], hi[0], shape[0])
-        if not jitter:
-            return made
-        moved = np.array(made.points)
-        move = np.random.default_rng(seed).uniform(-1, 1, (shape[0] - 2, 1))
-        moved[1:-1] += jitter * (hi[0] - lo[0]) / (shape[0] - 1) * move
-        return js.Cloud(moved, made.groups, made.normals)
-    return (js.rectangle if dim == 2 else js.box)(lo, hi, shape, jitter=jitter, seed=seed)
+    return scenes.lattice(lo, lo + size, SIDE[dim] if shape is None else shape, jitter, seed)()
 
 
 def moved(cloud, inside):
@@ -406,7 +315,7 @@ def attempt(name, method, order, make, ask):
     out = {"error": None, "estimate": None, "flags": [], "refused": None}
     try:
         task, cloud, options = make()
-        exact = PDES[name][1](np.asarray(cloud.points, float).T, jax.tree.map(np.asarray, task.params), np)
+        exact = FAMILIES[name].exact(np.asarray(cloud.points, float).T, jax.tree.map(np.asarray, task.params), np)
         size = float(np.linalg.norm(exact))
         sol = js.solve(task, cloud, method=method, order=order, **options)
     except (ValueError, js.SolveError) as fault:

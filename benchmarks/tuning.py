@@ -25,7 +25,7 @@ import numpy as np
 
 import jsmitsm as js
 from benchmarks.machine import describe
-from benchmarks.problems import PAPER, Case
+from benchmarks.problems import CASES, Case
 from jsmitsm.objective import nearest_distance, reference
 
 DATA = Path(__file__).parent / "data" / "tuning.json"
@@ -55,60 +55,28 @@ class Setup:
     spacing: float | None = None
 
 
-def _poisson(name: str, lo: tuple, hi: tuple, exact: Callable[[Any], Any], bcs: Any = None) -> Case:
-    """laplacian(u) = f with the solution ``exact``; ``bcs`` as in :class:`benchmarks.problems.Case`."""
-    return Case(name, "", lo, hi, lambda u, x: js.laplacian(u)(x) - js.laplacian(exact)(x), exact, bcs or {})
-
-
-def _diffusion(name: str, exact: Callable[[Any], Any]) -> Case:
-    """div((1 + sin(x + 2y)/2) grad u) = f on the unit square."""
-
-    def operator(u, x):
-        a = lambda y: 1.0 + 0.5 * jnp.sin(y[0] + 2 * y[1])
-        return js.divergence(lambda y: a(y) * js.grad(u)(y))(x)
-
-    return Case(name, "", (0.0, 0.0), (1.0, 1.0), lambda u, x: operator(u, x) - operator(exact, x), exact)
-
-
 def _setups() -> dict[str, Setup]:
-    square, cube = ((0.0, 0.0), (1.0, 1.0)), ((0.0,) * 3, (1.0,) * 3)
-    smooth = lambda x: jnp.exp(x[0]) * jnp.sin(2 * x[1]) + x[0] ** 3 * x[1]
-    peak = lambda w: lambda x: jnp.exp(-((x[0] - 0.45) ** 2 + (x[1] - 0.55) ** 2) / w**2)
-    slab = ((0.0, 0.0), (4.0, 9.0))
+    wave, skew = (lambda x: jnp.cos(0.8 * x[0] + 0.5) * jnp.cos(0.7 * x[1])), (lambda x: jnp.sin(7 * x[0] + 6 * x[1]))
+    rod = lambda x: jnp.sin(2 * x[0]) + jnp.exp(x[0] / 2)
+    wider = lambda x: jnp.exp(-((x[0] - 0.45) ** 2 + (x[1] - 0.55) ** 2) / 0.2**2)
     found = [
-        Setup(
-            "rod (4.1)", PAPER["rod"], lambda: js.interval(0.0, 2.0, 20), (2, 2, 2),
-            _poisson("rod, other", (0.0,), (2.0,), lambda x: jnp.sin(2 * x[0]) + jnp.exp(x[0] / 2)),
-        ),
-        Setup("plate (4.2)", PAPER["plate"], lambda: js.rectangle(*slab, (9, 19)), (2, 2, 4), smooth=False),
-        Setup(
-            "source (4.3)", PAPER["source"], lambda: js.rectangle(*slab, (9, 19)), (2, 2, 4),
-            _poisson("source, other", *slab, lambda x: jnp.cos(0.8 * x[0] + 0.5) * jnp.cos(0.7 * x[1]),
-                     {"bottom": js.neumann(0.0)}),
-        ),
-        Setup(
-            "oscillatory",
-            _poisson("oscillatory", *square, lambda x: jnp.sin(9 * x[0] + 1) * jnp.cos(8 * x[1])),
-            lambda: js.rectangle(*square, (15, 15)), (2, 2, 4),
-            _poisson("oscillatory, other", *square, lambda x: jnp.sin(7 * x[0] + 6 * x[1])),
-        ),
-        Setup(
-            "jittered", _diffusion("jittered", smooth), lambda: js.rectangle(*square, (14, 14), jitter=0.25, seed=5),
-            (2, 2, 4), _diffusion("jittered, other", lambda x: jnp.cos(3 * x[0]) * jnp.exp(x[1])),
-            spacing=1 / 13,
-        ),
-        Setup(
-            "narrow peak", _poisson("peak", *square, peak(0.12)), lambda: js.rectangle(*square, (17, 17)), (2, 2, 4),
-            _poisson("peak, other", *square, peak(0.2)),
-        ),
-        Setup(
-            "3D", _poisson("3D", *cube, lambda x: jnp.exp(x[0]) * jnp.sin(2 * x[1]) * jnp.cos(x[2])),
-            lambda: js.box(*cube, (7, 7, 7), jitter=0.1, seed=2), (2, 2, 2),
-            _poisson("3D, other", *cube, lambda x: jnp.cos(2 * x[0] + x[1]) * jnp.exp(-x[2])),
-            spacing=1 / 6,
-        ),
-    ]  # fmt: skip
+        _setup("rod (4.1)", "rod", (2, 2, 2), rod),
+        _setup("plate (4.2)", "plate", (2, 2, 4)),
+        _setup("source (4.3)", "source", (2, 2, 4), wave, {"bottom": js.neumann(0.0)}),
+        _setup("oscillatory", "oscillatory", (2, 2, 4), skew),
+        _setup("jittered", "jittered", (2, 2, 4), lambda x: jnp.cos(3 * x[0]) * jnp.exp(x[1]), spacing=1 / 13),
+        _setup("narrow peak", "narrow peak", (2, 2, 4), wider),
+        _setup("3D", "solid", (2, 2, 2), lambda x: jnp.cos(2 * x[0] + x[1]) * jnp.exp(-x[2]), spacing=1 / 6),
+    ]
     return {s.name: s for s in found}
+
+
+def _setup(name: str, case: str, orders: tuple[int, int, int], other: Any = None, bcs: Any = None,
+           spacing: float | None = None) -> Setup:  # fmt: skip
+    """A case of the table on its own cloud, and the other solution of its operator."""
+    known = CASES[case]
+    rest = None if other is None else known.solved_by(other, f"{case}, other", bcs)
+    return Setup(name, known, known.cloud, orders, rest, known.smooth, spacing)
 
 
 SETUPS = _setups()
@@ -182,7 +150,7 @@ def record(setup: Setup, method: str, quick: bool) -> dict[str, Any]:
     """Everything about one method on one setup."""
     b = bench(setup, method)
     paper, bounded = b.error(1.0, 4.0)
-    points = grid(b, 3 if quick or setup.case.dim == 3 else 1)
+    points = grid(b, 3 if quick or b.cloud.dim == 3 else 1)
     bound = max(BOUND, bounded) if np.isfinite(bounded) else BOUND
     admitted = [e for *_, e, lebesgue in points if np.isfinite(e) and lebesgue <= bound]
     return {
@@ -252,7 +220,7 @@ class Graded:
             square = (x[0] + near + shift) ** 2 + (x[1] + near + 0.5 * shift) ** 2
             return jnp.log(square) * (1.0 + x[0] * x[1])
 
-        return _poisson(self.name, (0.0, 0.0), (1.0, 1.0), exact)
+        return CASES["poisson 2D"].solved_by(exact, self.name)
 
 
 GRADED = {g.name: g for g in (Graded("density 1:20", 0.02, 0.09), Graded("density 1:400", 0.006, 0.12))}

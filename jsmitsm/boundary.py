@@ -78,11 +78,12 @@ class Part:
     numbers: Callable[[Any], tuple[Any, Any]]
 
 
-def group_conditions(problem: Problem, cloud: Cloud, order: int, highest: int) -> list[Group]:
+def group_conditions(problem: Problem, cloud: Cloud, order: int, orders: tuple[int, ...]) -> list[Group]:
     """Check the conditions against the cloud and lay them out, one entry per boundary group.
 
-    highest: the operator's order. Raises ValueError for missing, unknown or impossible conditions.
+    orders: those of the operator's equations. Raises ValueError for missing, unknown or impossible conditions.
     """
+    highest = max(orders)
     names = [name for name in cloud.groups if name != INTERIOR]
     given = dict(problem.bcs)
     used = {name for cs in given.values() for c in cs if c.kind == "periodic" for name in c.groups}
@@ -106,6 +107,7 @@ def group_conditions(problem: Problem, cloud: Cloud, order: int, highest: int) -
     if not any(c.kind not in ("free",) for cs in given.values() for c in cs):
         raise ValueError(f"bcs: no condition on any group ({names}), so the solution is not determined; give one")
     groups = []
+    counts = {name: 0 for name in names if name not in used and len(cloud.groups[name])}
     for name, conditions in given.items():
         pinned = [c for c in conditions if c.kind == "fix"]
         if name not in cloud.groups and len(pinned) < len([c for c in conditions if c.kind != "periodic"]):
@@ -116,9 +118,31 @@ def group_conditions(problem: Problem, cloud: Cloud, order: int, highest: int) -
         rest = [c for c in conditions if c.kind not in ("fix", "periodic", "free")]
         if rest:
             groups.append(_laid_out(problem, cloud, name, cloud.groups[name], rest, order, highest))
+            counts[name] = len(groups[-1].held) + groups[-1].n_rows
+    _refuse_too_many(counts, sum(orders), problem.fields)
     groups = [g for g in groups if len(g.ids)]
     _refuse_held_twice(groups, problem.fields, len(cloud))
     return groups
+
+
+def _refuse_too_many(counts: dict[str, int], total: int, fields: int) -> None:
+    """More conditions on a side than the operator takes.
+
+    An operator of order m takes m of them along a line through the domain, on both of its ends
+    together: all of them may stand on one side (a start in time) only where another side has fewer.
+    """
+    most = max(total, fields)
+    for name, count in counts.items():
+        if count > most:
+            raise ValueError(
+                f"bcs[{name!r}]: {count} conditions on one side, but an operator of order {total} takes at most "
+                f"{most}; remove some"
+            )
+        if fields == 1 and 2 * count > total and 2 * min(counts.values()) >= total and total % 2 == 0:
+            raise ValueError(
+                f"bcs[{name!r}]: {count} conditions, and at least {total // 2} on every other side, but an operator of "
+                f"order {total} takes {total // 2} on each; remove some, or let another side have js.free()"
+            )
 
 
 def _refuse_held_twice(groups: list[Group], fields: int, n: int) -> None:

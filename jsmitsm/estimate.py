@@ -156,7 +156,7 @@ class Factorization:
         nums = self._nums if nums is None else nums
         disc = self._disc
         run = copy(self._run)  # the solution's own: what it says of itself must not change with the next
-        run.problem = problem
+        run.problem, run.messages = problem, list(self._run.messages)
         x, good = run.solved(*self._matrix, dz.right_side(disc, nums, self._classes, self._rows))
         values = dz.with_held(disc, nums, x)
         run.rows, run.nums, run.values = (self._classes, self._rows), nums, np.asarray(values)

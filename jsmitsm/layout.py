@@ -97,7 +97,7 @@ def discretize(
     traced = _traced(problem, cloud.dim)
     _check_operator(traced, problem, order)
     rec = recursion(cloud.dim, order, problem.fields, traced.slots, traced.pattern, traced.order)
-    groups = group_conditions(problem, cloud, order, max(traced.order))
+    groups = group_conditions(problem, cloud, order, traced.order)
     held = np.zeros((len(cloud), problem.fields), bool)
     for group in groups:
         for k in group.held:

@@ -20,7 +20,7 @@ from jsmitsm.problem import Problem
 
 # A solvable pure Neumann problem leaves a mean residual below this part of its data,
 COMPATIBLE = 1e-6
-# or one that two more orders, up to the highest, leave less than this part of.
+# or one that falls to less than this part of itself from one order to two orders higher.
 KEPT, HIGHEST = 0.5, 14
 
 
@@ -52,12 +52,13 @@ class Run:
         if self.repair and self.health is None and disc.scheme.method in ("S", "III"):
             classes, rows, self.health = health.repaired(disc, nums, classes, rows)
             disc.classes = classes
-            self._tell_repairs()
         else:
             before = self.health
             self.health = health.examine(classes, rows)
             if before is not None:  # Newton's later steps keep the stencils of the first
                 self.health.repaired = before.repaired
+        if self.repair:
+            self._tell_repairs()
         bad = self.health.undetermined
         if len(bad):
             self.fail(
@@ -90,6 +91,7 @@ class Run:
         """Assemble and solve one linear system: values (N, F), and whether it went well."""
         clock, disc = time.perf_counter, self.disc
         t0 = clock()
+        self.messages.clear()  # those of an earlier step speak of other rows
         if self.formulation == "auto":
             self.formulation = "lsq" if dz.prefers_least_squares(disc, nums) else "loo"
         if self.formulation == "lsq":
@@ -153,16 +155,19 @@ class Run:
         self.messages.append("The conditions fix the solution only up to a constant; its mean over the particles is 0.")
         if rest <= COMPATIBLE:
             return
-        # The discretisation's share falls with the order, a real imbalance stays.
+        # The discretisation's share falls with the order, a real imbalance stays. The highest orders look down.
+        up = self.disc.rec.order + 2 <= HIGHEST
         try:
-            higher = self._imbalance_at(min(self.disc.rec.order + 2, HIGHEST))
+            other = self._imbalance_at(self.disc.rec.order + (2 if up else -2))
         except ValueError:  # too few particles to tell
-            higher = rest
-        if higher > max(COMPATIBLE, KEPT * rest):
+            other = rest
+        lower, higher = (rest, other) if up else (other, rest)
+        if higher > max(COMPATIBLE, KEPT * lower):
             self.fail(
                 "the conditions are incompatible: nothing fixes the value, and the data do not balance (mean residual "
-                f"{rest:.1e} of the data, and {higher:.1e} two orders higher); correct the source or the fluxes, hold "
-                "a value (js.dirichlet, js.fix), or refine a cloud that is too coarse for its data"
+                f"{rest:.1e} of the data, and {other:.1e} two orders {'higher' if up else 'lower'}); correct the "
+                "source or the fluxes, hold a value (js.dirichlet, js.fix), or refine a cloud that is too coarse for "
+                "its data"
             )
 
     def _imbalance_at(self, order: int) -> float:

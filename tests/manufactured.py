@@ -1,4 +1,4 @@
-"""Clouds, operators and polynomials that the tests share."""
+"""Clouds, polynomials and conditions that the tests share; equations come from the table of problems."""
 
 from __future__ import annotations
 
@@ -6,22 +6,15 @@ import jax.numpy as jnp
 import numpy as np
 
 import jsmitsm as js
+from benchmarks import scenes
+from benchmarks.problems import SIDES
 
 METHODS = ("I", "II", "III", "S", "SSPH")
-SIDES = {1: ("left", "right"), 2: ("left", "right", "bottom", "top"),
-         3: ("left", "right", "bottom", "top", "front", "back")}  # fmt: skip
 
 
 def jittered(dim: int, n: int, jitter: float = 0.25, seed: int = 1) -> js.Cloud:
-    """A jittered lattice of n^dim particles on [0, 1]^dim, ``js.interval`` having no jitter of its own."""
-    if dim == 2:
-        return js.rectangle((0, 0), (1, 1), (n, n), jitter=jitter, seed=seed)
-    if dim == 3:
-        return js.box((0, 0, 0), (1, 1, 1), (n, n, n), jitter=jitter, seed=seed)
-    x = np.linspace(0.0, 1.0, n)
-    x[1:-1] += jitter * x[1] * np.random.default_rng(seed).uniform(-1, 1, n - 2)
-    groups = {"interior": np.arange(1, n - 1), "left": [0], "right": [n - 1]}
-    return js.Cloud(x[:, None], groups, np.concatenate([[-1.0], np.full(n - 2, np.nan), [1.0]])[:, None])
+    """A jittered lattice of n^dim particles on [0, 1]^dim."""
+    return scenes.lattice((0.0,) * dim, (1.0,) * dim, n, jitter, seed)()
 
 
 def polynomial(dim: int, order: int, seed: int = 3):
@@ -42,29 +35,13 @@ def polynomial(dim: int, order: int, seed: int = 3):
     return u
 
 
-def laplace(u, x):
-    return js.laplacian(u)(x)
-
-
-def variable(u, x):
-    """div(a grad u) + b . grad u - c u: every kind of term, no coefficient constant."""
-    a = lambda y: 1.0 + 0.3 * jnp.sin(jnp.sum(y)) + 0.2 * y[0]
-    flux = lambda y: a(y) * js.grad(u)(y)
-    return js.divergence(flux)(x) + (1.0 + x[0]) * js.partial(u, (1,) + (0,) * (len(x) - 1))(x) - jnp.exp(x[-1]) * u(x)
-
-
-def with_source(operator, exact):
-    """The residual whose solution is ``exact``: the same operator applied to the known function."""
-    return lambda u, x: operator(u, x) - operator(exact, x)
-
-
 def along(normal, f):
     return lambda x: jnp.dot(jnp.asarray(normal), js.grad(f)(x))
 
 
 def conditions(dim: int, exact, kind: str) -> dict:
     """All sides Dirichlet, or the left one Neumann and the right one Robin, of a known function."""
-    bcs = {name: js.dirichlet(exact) for name in SIDES[dim]}
+    bcs = {name: js.dirichlet(exact) for name in SIDES[: 2 * dim]}
     if kind != "dirichlet":
         unit = np.eye(dim)[0]
         bcs["left"] = js.neumann(along(-unit, exact))

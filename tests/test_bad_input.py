@@ -226,6 +226,13 @@ ON_A_CLOUD = [
     ("two-values", ends(left=[js.dirichlet(0.0), js.dirichlet(1.0)]), r"bcs\['left'\]", "remove"),
     ("value-and-robin-value", ends(left=[js.dirichlet(0.0), js.condition(lambda u, x, n: u(x))]), r"bcs\['left'\]",
      "remove"),
+    ("value-and-slope", ends(left=[js.dirichlet(0.0), js.neumann(1.0)]), r"bcs\['left'\]: 2 conditions", "remove some"),
+    ("three-at-a-start", ends(left=[js.dirichlet(0.0), js.neumann(1.0), js.robin(1.0, 1.0, 1.0)], right=js.free()),
+     r"bcs\['left'\]: 3 conditions", "remove some"),
+    ("clamped-and-more", solve(
+        pde=lambda u, x: js.laplacian(js.laplacian(u))(x),
+        bcs=dict.fromkeys(ENDS, [js.dirichlet(0.0), js.neumann(0.0), js.condition(lambda u, x, n: js.laplacian(u)(x))])),
+     r"bcs\['left'\]: 3 conditions", "order 4 takes 2"),
     ("array-length", ends(left=js.dirichlet(np.zeros(2))), r"bcs\['left'\].value", r"scalar or \(1,\)"),
     ("array-2d", ends(left=js.dirichlet(np.zeros((1, 1)))), r"bcs\['left'\].value", r"scalar or \(1,\)"),
     ("array-neumann", ends(left=js.neumann(np.zeros(2))), r"bcs\['left'\].value", r"scalar or \(1,\)"),

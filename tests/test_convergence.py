@@ -7,17 +7,16 @@ by two or more. Each error has a ceiling besides: a method may converge at the r
 be bad.
 """
 
-import jax
-import jax.numpy as jnp
 import manufactured as mm
 import numpy as np
 import pytest
 
 import jsmitsm as js
+from benchmarks.problems import CASES
 
 # dim, order: particles along an axis, coarse and fine, and ceilings of the fine error with Dirichlet
 # sides and with one Neumann side, about three times what was seen.
-CASES = {
+SIZES = {
     (1, 2): (11, 41, 2e-4, 5e-3), (1, 4): (11, 41, 1.2e-7, 2e-6), (1, 6): (11, 25, 6e-10, 1e-7),
     (2, 2): (11, 31, 1.2e-4, 1e-4), (2, 4): (11, 21, 4e-7, 1.2e-6), (2, 6): (11, 21, 6e-10, 2e-8),
     (3, 2): (6, 11, 8e-4, 1.3e-3), (3, 4): (6, 11, 4e-6, 4e-5), (3, 6): (8, 13, 2e-8, 5e-7),
@@ -27,20 +26,13 @@ SEEDS = {(1, "dirichlet"): 8, (1, "neumann"): 4, (2, "dirichlet"): 4, (2, "neuma
          (3, "neumann"): 1}  # fmt: skip
 
 
-def exact(x):
-    """Smooth, without symmetry, no polynomial; works in any dimension."""
-    value = jnp.exp(x[0]) * jnp.sin(2.0 * x[-1] + 0.4)
-    return value if len(x) < 3 else value + jnp.cos(x[0] + 2.0 * x[1])
-
-
 def solve(order, kind, cloud):
-    problem = js.Problem(mm.with_source(mm.laplace, exact), mm.conditions(cloud.dim, exact, kind))
-    return js.solve(problem, cloud, order=order)
+    case = CASES[f"plain {cloud.dim}D"]
+    return js.solve(case.problem(**mm.conditions(cloud.dim, case.exact, kind)), cloud, order=order)
 
 
 def relative_l2(sol):
-    true = np.asarray(jax.vmap(exact)(sol.cloud.points))
-    return float(np.linalg.norm(np.asarray(sol.u) - true) / np.linalg.norm(true))
+    return CASES[f"plain {sol.cloud.dim}D"].error(sol)
 
 
 def typical_error(dim, n, order, kind):
@@ -49,9 +41,9 @@ def typical_error(dim, n, order, kind):
 
 
 @pytest.mark.parametrize("kind", ["dirichlet", "neumann"])
-@pytest.mark.parametrize("dim, order", CASES)
+@pytest.mark.parametrize("dim, order", SIZES)
 def test_observed_order(dim, order, kind):
-    coarse, fine, *ceilings = CASES[dim, order]
+    coarse, fine, *ceilings = SIZES[dim, order]
     errors = [typical_error(dim, n, order, kind) for n in (coarse, fine)]
     rate = np.log(errors[0] / errors[1]) / np.log((fine - 1) / (coarse - 1))
     assert rate >= order - 0.3, f"order {rate:.2f} from errors {errors}"
@@ -68,7 +60,7 @@ def test_a_thousand_scattered_particles_at_order_six():
              np.stack([side[1:-1], np.zeros(31)], 1), np.stack([side[1:-1], np.ones(31)], 1)]  # fmt: skip
     points = np.concatenate([inner, *edges])
     ends = np.cumsum([900, 33, 33, 31, 31])
-    groups = dict(zip(("interior", *mm.SIDES[2]), np.split(np.arange(len(points)), ends[:-1])))
+    groups = dict(zip(("interior", *mm.SIDES[:4]), np.split(np.arange(len(points)), ends[:-1])))
     sol = solve(6, "dirichlet", js.Cloud(points, groups))
     assert sol.converged and relative_l2(sol) < 1e-9
 
@@ -76,10 +68,11 @@ def test_a_thousand_scattered_particles_at_order_six():
 def test_the_polynomials_converge_between_particles():
     """sol(points) and sol.grad(points) at order 4 away from particles: orders 4 and 3, loosely."""
     points = np.random.default_rng(0).uniform(0.1, 0.9, (200, 2))
+    exact = CASES["plain 2D"].exact
     true = mm.values(exact, points)
     slopes = np.array([np.asarray(js.grad(exact)(x)) for x in points])
     errors = []
-    for n in CASES[2, 4][:2]:
+    for n in SIZES[2, 4][:2]:
         sol = solve(4, "dirichlet", mm.jittered(2, n, 0.25, seed=2))
         errors.append((np.abs(sol(points) - true).max(), np.abs(sol.grad(points) - slopes).max()))
     rates = np.log2(np.array(errors[0]) / np.array(errors[1]))

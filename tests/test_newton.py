@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 import jsmitsm as js
+from benchmarks import scenes
+from benchmarks.problems import CASES
 
 ENDS = {"left": js.dirichlet(0.0), "right": js.dirichlet(0.0)}
 # Beyond this the equation u'' + c exp(u) = 0 with u = 0 at both ends has no solution.
@@ -59,3 +61,14 @@ def test_no_solution_is_reported():
         js.solve(bratu(5.0), js.interval(0.0, 1.0, 21))
     sol = js.solve(bratu(5.0), js.interval(0.0, 1.0, 21), throw=False)
     assert not sol.converged and "NOT converge" in sol.diagnose()
+
+
+def test_what_is_told_is_of_the_last_step():
+    """The stencils are those of the first step; how weak they are changes with the coefficients."""
+    cloud = scenes.step(sparse=0.2, ratio=5.0)
+    sol = CASES["quasilinear"].solve(4, cloud)
+    told = [m for m in sol.stats["messages"] if "stay weak" in m]
+    assert sol.converged and sol.iterations > 2 and len(told) == 1
+    assert f"{len(sol.stats['weak'])} particle(s)" in told[0]
+    assert f"at most {sol.stats['lebesgue_max']:.3g})" in told[0]
+    assert sum("widened or balanced" in m for m in sol.stats["messages"]) == 1

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 import jsmitsm as js
+from benchmarks.problems import CASES
 from jsmitsm import assembly
 
 NAMES = """
@@ -132,7 +133,7 @@ print(time.process_time() - start)
 
 CLOUD = mm.jittered(1, 12)
 EXACT = mm.polynomial(1, 4)
-PROBLEM = js.Problem(mm.with_source(mm.laplace, EXACT), mm.conditions(1, EXACT, "dirichlet"))
+PROBLEM = CASES["poisson 1D"].solved_by(EXACT).problem()
 
 
 @pytest.fixture(scope="module")

@@ -22,7 +22,7 @@ HARD = {
 
 
 def error(sol, name, q):
-    exact = st.PDES[name][1](np.asarray(sol.cloud.points).T, q, np)
+    exact = st.FAMILIES[name].exact(np.asarray(sol.cloud.points).T, q, np)
     return float(np.linalg.norm(np.asarray(sol.u) - exact) / np.linalg.norm(exact))
 
 
