@@ -256,10 +256,21 @@ def _named(where: str, expected: str) -> Iterator[None]:
     """Say which of the user's functions failed, and what was expected of it."""
     try:
         yield
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, IndexError) as error:
         if str(error).startswith(where):
             raise
-        raise ValueError(f"{where}: expected {expected}; calling it failed: {error}") from error
+        raise ValueError(f"{where}: expected {expected}; calling it failed: {in_words(error)}") from error
+
+
+def in_words(error: Exception) -> str:
+    """What went wrong in a user's function, with the remedy where Python's own message has none."""
+    text = str(error)
+    if isinstance(error, jax.errors.ConcretizationTypeError | jax.errors.TracerArrayConversionError):
+        return (f"{text.splitlines()[0]} It must be written in jax.numpy: jnp.sin for np.sin or math.sin, "
+                "jnp.where for an if")  # fmt: skip
+    if isinstance(error, IndexError):
+        return f"{text}; x is one point of shape (D,), x[0] its first coordinate"
+    return text
 
 
 def _shaped(result: Any, components: int, where: str) -> Any:

@@ -28,6 +28,9 @@ class Quadrature(NamedTuple):
     weights: np.ndarray
     normals: np.ndarray
 
+    def __repr__(self) -> str:
+        return f"Quadrature({len(self.points)} points, weights that sum to {self.weights.sum():.6g})"
+
 
 def quadrature(cloud: Cloud, group: str) -> Quadrature:
     """Points and weights for integrals over a boundary group.

@@ -259,9 +259,8 @@ def _places(cloud: Cloud, at: Mapping[str, float] | None) -> list[tuple[int, flo
         lo, hi = points.min(axis=0), points.max(axis=0)
         digits = 2 - int(np.floor(np.log10((hi - lo).max())))
         return [(k, float(np.round((lo[k] + hi[k]) / 2, digits)) + 0.0) for k in (2, 1, 0)]
-    unknown = sorted(set(at) - set(_NAMES))
-    if unknown or not at:
-        raise ValueError(f'at: {dict(at)!r} is not a dict of positions by axis, such as {{"x": 0.5, "z": 0.2}}')
+    if not isinstance(at, Mapping) or not at or set(at) - set(_NAMES):
+        raise ValueError(f'at: {at!r} is not a dict of positions by axis, such as {{"x": 0.5, "z": 0.2}}')
     return [(_NAMES.index(name), float(position)) for name, position in at.items()]
 
 

@@ -164,6 +164,11 @@ class Factorization:
         fit = Fit(problem, disc.cloud, disc.kernel, dz.table(disc), None, recipe)
         return Solution(values, disc.cloud, recipe, fit, good, 1, run.stats(), report=run.flags)
 
+    def __reduce__(self):
+        raise TypeError(
+            "a Factorization is not pickled, nor copied: keep the problem and the cloud, and call js.factorize again"
+        )
+
     def __repr__(self) -> str:
         return f"Factorization({int((~self._disc.held).sum())} unknowns, method={self._disc.scheme.method!r})"
 

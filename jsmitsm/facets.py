@@ -24,6 +24,8 @@ _FACETS: dict[str, list[tuple[int, ...]]] = {
 _DIMS = {"vertex": 0} | {
     kind: 1 if kind.startswith("line") else 2 if kind.startswith(("tri", "quad")) else 3 for kind in _FACETS
 }
+# Beyond 30 degrees there is a corner.
+_SMOOTH = np.cos(np.radians(30.0))
 _CORNERS = {"line": 2, "triangle": 3, "quad": 4, "tetra": 4, "hexahedron": 8, "wedge": 6, "pyramid": 5}
 _TAGS = ("gmsh:physical", "medit:ref", "cell_tags", "gambit:ref", "su2:tag", "avsucd:material")
 
@@ -42,8 +44,8 @@ def volume_cells(blocks: Any) -> tuple[int, list[tuple[str, np.ndarray]]]:
     return dim, [(kind, block) for kind, block in blocks if _DIMS[kind] == dim]
 
 
-def boundary_normals(points: np.ndarray, cells: list[tuple[str, np.ndarray]]) -> np.ndarray:
-    """Unit outward normals (N, D) of the nodes on facets that belong to one cell only, NaN elsewhere."""
+def outer_facets(points: np.ndarray, cells: list[tuple[str, np.ndarray]]) -> list[tuple[np.ndarray, np.ndarray]]:
+    """The facets that belong to one cell only, by their nodes (M, k), with the centres of their cells (M, D)."""
     dim = points.shape[1]
     facets, centres = [], []
     for kind, block in cells:
@@ -55,11 +57,41 @@ def boundary_normals(points: np.ndarray, cells: list[tuple[str, np.ndarray]]) ->
     _, first, count = np.unique(np.concatenate(heads), axis=0, return_index=True, return_counts=True)
     outer = np.zeros(sum(map(len, heads)), bool)
     outer[first[count == 1]] = True
+    masks = np.split(outer, np.cumsum([len(h) for h in heads])[:-1])
+    return [(nodes[mask], centre[mask]) for nodes, centre, mask in zip(facets, centres, masks)]
+
+
+def boundary_normals(points: np.ndarray, outer: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+    """Unit outward normals (N, D) of the nodes on the facets ``outer``, averaged by angle; NaN elsewhere."""
     total = np.zeros(points.shape)
-    for nodes, centre, mask in zip(facets, centres, np.split(outer, np.cumsum([len(h) for h in heads])[:-1])):
-        _add_normals(total, points, nodes[mask], centre[mask])
+    for nodes, centre in outer:
+        _add_normals(total, points, nodes, centre)
     length = np.linalg.norm(total, axis=1, keepdims=True)
     return np.where(length > 0, total / np.where(length > 0, length, 1.0), np.nan)
+
+
+def side_normals(points: np.ndarray, outer: list[tuple[np.ndarray, np.ndarray]], members: np.ndarray) -> np.ndarray:
+    """Unit outward normals (N, D) of one side of the boundary, from the facets all of whose nodes are ``members`` (N,).
+
+    In 2D an end of a curved side has one chord only; its normal is the next one's, mirrored in the chord's: exact on
+    a circle.
+    """
+    outer = among(outer, members)
+    normals = boundary_normals(points, outer)
+    if points.shape[1] != 2 or not any(nodes.shape[1] == 2 for nodes, _ in outer):
+        return normals
+    chords = np.concatenate([nodes[:, k] for nodes, _ in outer for k in ([0, 1], [1, 0]) if nodes.shape[1] == 2])
+    single = np.bincount(chords[:, 0], minlength=len(points))[chords[:, 0]] == 1
+    end, near = chords[single].T
+    cosine = np.sum(normals[end] * normals[near], axis=1, keepdims=True)
+    mirrored = 2.0 * cosine * normals[end] - normals[near]
+    normals[end] = np.where(cosine > _SMOOTH, mirrored, normals[end])
+    return normals
+
+
+def among(outer: list[tuple[np.ndarray, np.ndarray]], members: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """The facets all of whose nodes are ``members``, a mask (N,)."""
+    return [(nodes[keep], centre[keep]) for nodes, centre in outer for keep in [members[nodes].all(axis=1)]]
 
 
 def _add_normals(total: np.ndarray, points: np.ndarray, facets: np.ndarray, centres: np.ndarray) -> None:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from jsmitsm.clouds import INTERIOR, Cloud
-from jsmitsm.facets import boundary_normals, named_facets, volume_cells
+from jsmitsm.facets import boundary_normals, named_facets, outer_facets, side_normals, volume_cells
 from jsmitsm.shapes import from_polygon
 from jsmitsm.simplices import simplices
 from jsmitsm.solution import Solution
@@ -40,7 +40,8 @@ def from_mesh(mesh: Any, tags: str | None = None) -> Cloud:
     Returns
     -------
     Cloud : groups ``"interior"`` and one for every tag of boundary facets. A node on two of them belongs to the one
-        named first, a boundary node on none to ``"boundary"``. Normals are those of the facets, averaged by angle.
+        named first, a boundary node on none to ``"boundary"``. Normals are those of the group's facets, averaged by
+        angle: on curved sides as exact as the facets follow them; ``cloud.replace(normals=...)`` takes better ones.
 
     Raises
     ------
@@ -74,7 +75,8 @@ def from_mesh(mesh: Any, tags: str | None = None) -> Cloud:
     new[used] = np.arange(len(used))
     points = np.ascontiguousarray(points[used, :dim])
     cells = [(kind, new[block]) for kind, block in cells]
-    normals = boundary_normals(points, cells)
+    outer = outer_facets(points, cells)
+    normals = boundary_normals(points, outer)
     free = np.isfinite(normals[:, 0])
     groups = {INTERIOR: np.flatnonzero(~free)}
     for name, nodes in named_facets(mesh, dim, tags).items():
@@ -86,6 +88,11 @@ def from_mesh(mesh: Any, tags: str | None = None) -> Cloud:
                 raise ValueError(f"mesh: boundary facets are tagged {INTERIOR!r}, the name of what lies inside; rename")
             groups[name] = claimed
             free[claimed] = False
+            members = np.zeros(len(points), bool)
+            members[nodes] = True
+            # At a corner between groups the normal is that of the own side: what is said of a side holds to its end.
+            own = side_normals(points, outer, members)[claimed]
+            normals[claimed] = np.where(np.isfinite(own), own, normals[claimed])
     if free.any():
         groups["boundary"] = np.union1d(groups.get("boundary", np.zeros(0, int)), np.flatnonzero(free))
     return Cloud(points, groups, normals)

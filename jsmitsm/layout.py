@@ -9,7 +9,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from jsmitsm.boundary import Group, group_conditions, is_traced
+from jsmitsm.boundary import Group, group_conditions, in_words, is_traced
 from jsmitsm.clouds import Cloud
 from jsmitsm.kernels import EDGE, Constant, Gaussian, Kernel
 from jsmitsm.moments import Scheme
@@ -211,8 +211,8 @@ def _traced(problem: Problem, dim: int) -> Traced:
         pass
     try:
         return trace(problem.pde, dim, problem.fields, params=problem.params)
-    except (TypeError, ValueError) as error:
-        text = str(error)
+    except (TypeError, ValueError, IndexError) as error:
+        text = in_words(error)
         raise ValueError(text if text.startswith("pde") else f"pde: {text}; it returns a number or a scalar per "
                          "equation") from error  # fmt: skip
 

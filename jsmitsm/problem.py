@@ -42,6 +42,8 @@ class Condition:
 
     def __repr__(self) -> str:
         def short(v: Any) -> str:
+            if isinstance(v, tuple) and len(v) > 6:
+                return f"({v[0]}, {v[1]}, ... {len(v)} in all)"
             return "<function>" if callable(v) else f"array{v.shape}" if np.ndim(v) and hasattr(v, "shape") else str(v)
 
         shown = [f"{k}={short(v)}" for k, v in self.parts.items()]

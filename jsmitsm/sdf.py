@@ -44,6 +44,7 @@ __all__ = [
     "scale",
     "shell",
     "smooth_union",
+    "sphere",
     "torus",
     "translate",
     "union",
@@ -53,7 +54,8 @@ Sdf = Callable[[jax.Array], jax.Array]
 
 
 def ball(center: Any, radius: Any) -> Sdf:
-    """The ball |x - center| < radius in any dimension; ``center`` (D,), lengths in length units.
+    """The ball |x - center| < radius in any dimension, also called :func:`sphere`; ``center`` (D,), lengths in length
+    units.
 
     Raises ValueError for a radius that is not positive.
 
@@ -62,7 +64,7 @@ def ball(center: Any, radius: Any) -> Sdf:
     3.0
     """
     center, radius = _vector("center", center), _positive("radius", radius)
-    return lambda x: _norm(x - center) - radius
+    return lambda x: _norm(_from(x, center)) - radius
 
 
 def circle(center: Any, radius: Any) -> Sdf:
@@ -76,6 +78,7 @@ def circle(center: Any, radius: Any) -> Sdf:
 
 
 disk = circle
+sphere = ball
 
 
 def box(lo: Any, hi: Any) -> Sdf:
@@ -92,7 +95,7 @@ def box(lo: Any, hi: Any) -> Sdf:
     if _concrete(lo) and _concrete(hi) and not (hi > lo).all():
         raise ValueError(f"hi: {hi} must be greater than lo = {lo} along every axis; swap the two corners")
     center, half = (lo + hi) / 2, (hi - lo) / 2
-    return lambda x: _corner_distance(jnp.abs(x - center) - half)
+    return lambda x: _corner_distance(jnp.abs(_from(x, center)) - half)
 
 
 def rectangle(lo: Any, hi: Any) -> Sdf:
@@ -129,7 +132,7 @@ def half_space(point: Any, normal: Any) -> Sdf:
     if _concrete(normal) and not np.any(normal):
         raise ValueError("normal: a zero vector came, a direction out of the half-space was expected")
     unit = normal / (jnp if isinstance(normal, jax.core.Tracer) else np).linalg.norm(normal)
-    return lambda x: jnp.dot(x - point, unit)
+    return lambda x: jnp.dot(_from(x, point), unit)
 
 
 def ellipse(center: Any, semi_axes: Any) -> Sdf:
@@ -146,7 +149,7 @@ def ellipse(center: Any, semi_axes: Any) -> Sdf:
     axes = _positive("semi_axes", _vector("semi_axes", semi_axes, np.shape(center)[0]))
 
     def sdf(x: jax.Array) -> jax.Array:
-        y = (x - center) / axes
+        y = _from(x, center) / axes
         radius, slope = _norm(y), _norm(y / axes)
         # At the centre the ratio radius / slope has no limit; any value between the semi-axes serves.
         ratio = jnp.where(slope > 0, radius / jnp.where(slope > 0, slope, 1.0), jnp.min(axes))
@@ -171,7 +174,7 @@ def capsule(a: Any, b: Any, radius: Any) -> Sdf:
     along = _vector("b", b, np.shape(a)[0]) - a
 
     def sdf(x: jax.Array) -> jax.Array:
-        t = jnp.clip(jnp.dot(x - a, along) / jnp.dot(along, along), 0.0, 1.0)
+        t = jnp.clip(jnp.dot(_from(x, a), along) / jnp.dot(along, along), 0.0, 1.0)
         return _norm(x - a - t * along) - radius
 
     return sdf
@@ -192,7 +195,7 @@ def cylinder(a: Any, b: Any, radius: Any) -> Sdf:
     def sdf(x: jax.Array) -> jax.Array:
         length = _norm(along)
         axis = along / length
-        z = jnp.dot(x - a, axis)
+        z = jnp.dot(_from(x, a), axis)
         across = _norm(x - a - z * axis)
         return _corner_distance(jnp.stack([across - radius, jnp.abs(z - length / 2) - length / 2]))
 
@@ -213,7 +216,7 @@ def torus(center: Any, major: Any, minor: Any, axis: Any = (0.0, 0.0, 1.0)) -> S
 
     def sdf(x: jax.Array) -> jax.Array:
         unit = axis / _norm(axis)
-        z = jnp.dot(x - center, unit)
+        z = jnp.dot(_from(x, center), unit)
         across = _norm(x - center - z * unit)
         return _norm(jnp.stack([across - major, z])) - minor
 
@@ -332,7 +335,7 @@ def translate(shape: Sdf, offset: Any) -> Sdf:
     -1.0
     """
     offset = _vector("offset", offset)
-    return lambda x: shape(x - offset)
+    return lambda x: shape(_from(x, offset))
 
 
 def scale(shape: Sdf, factor: Any, center: Any = None) -> Sdf:
@@ -416,6 +419,16 @@ def _combine(pick: Callable[[jax.Array, jax.Array], jax.Array], shapes: Sequence
         return value
 
     return sdf
+
+
+def _from(x: jax.Array, origin: Any) -> jax.Array:
+    """x - origin; a point of another dimension would be broadcast to a shape that nobody meant."""
+    if jnp.shape(x) != jnp.shape(origin):
+        raise ValueError(
+            f"sdf: a shape in {len(origin)}D was asked at a point of shape {jnp.shape(x)}; bounds and points must have "
+            "its dimension"
+        )
+    return x - origin
 
 
 def _norm(v: jax.Array) -> jax.Array:

@@ -14,6 +14,10 @@ from jsmitsm.evenness import quality as quality
 from jsmitsm.packing import Spacing
 from jsmitsm.progress import bar
 
+# The cosine of 5 degrees: boundary particles whose normals differ by more may stand on two sides of a corner.
+_ALIKE = np.cos(np.radians(5.0))
+# Normals of neighbours on one side differ by less than 30 degrees.
+_SMOOTH = np.cos(np.radians(30.0))
 Predicate = Callable[[np.ndarray], Any]
 
 
@@ -40,8 +44,8 @@ def from_sdf(
     Returns
     -------
     Cloud : interior particles first, then the boundary's. Corners of 2D shapes are particles. Normals are the unit
-        gradients of ``sdf``, at corners the normalised bisector. No interior particle is closer to the boundary
-        than about half a spacing. Use :func:`quality` to see how even the cloud is.
+        gradients of ``sdf``, at corners the normalised bisector, between two groups that of the own side. No interior
+        particle is closer to the boundary than about half a spacing. Use :func:`quality` to see how even the cloud is.
 
     Raises
     ------
@@ -96,8 +100,8 @@ def from_polygon(
     Returns
     -------
     Cloud : interior particles first, then the boundary's. Every corner is a particle, its normal the normalised
-        bisector of its edges'. Where many short edges stand for a curve (turns of less than 20 degrees, edges shorter
-        than the spacing), particles are spread evenly along them instead.
+        bisector of its edges', between two groups that of the own edge. Where many short edges stand for a curve
+        (turns of less than 20 degrees, edges shorter than the spacing), particles are spread evenly along them instead.
 
     Raises
     ------
@@ -146,10 +150,44 @@ def _cloud(
             "spacing: too coarse for the shape, no interior particle fits half a spacing away from its "
             f"{len(boundary.points)} boundary particles; reduce it well below the width of the shape"
         )
+    boundary = levelset.Boundary(boundary.points, _own_normals(region, spacing, boundary, named))
     index = {INTERIOR: np.arange(len(inside))}
     index |= {name: members + len(inside) for name, members in named.items()}
     normals = np.concatenate([np.full(inside.shape, np.nan), boundary.normals])
     return Cloud(np.concatenate([inside, boundary.points]), index, normals)
+
+
+def _own_normals(
+    region: packing.Region, spacing: Spacing, boundary: levelset.Boundary, named: dict[str, np.ndarray]
+) -> np.ndarray:
+    """The normals (B, D), at corners between groups those of the own side: what is said of a side holds to its end."""
+    points, normals = boundary
+    dim = points.shape[1]
+    if len(named) == 1 or dim == 1:
+        return normals
+    from scipy.spatial import cKDTree
+
+    label = np.empty(len(points), int)
+    for k, members in enumerate(named.values()):
+        label[members] = k
+    away, near = cKDTree(points).query(points, k=min(6 * dim - 7, len(points)))
+    around = away <= 1.6 * spacing(points)[:, None]
+    around &= np.einsum("md,mkd->mk", normals, normals[near]) < _ALIKE
+    own = around & (label[near] == label[:, None])
+    own &= (around & (label[near] != label[:, None])).any(axis=1)[:, None]
+    at, which = np.nonzero(own)
+    # A little towards a neighbour on the own side the distance grows along that side's normal.
+    step, little = points[near[at, which]] - points[at], 1e-7
+    if isinstance(region, polygons.PolygonRegion):  # known by distances: off its edges, and farther for the digits
+        step += 0.1 * np.linalg.norm(step, axis=1, keepdims=True) * normals[at]
+        little = 1e-3
+    side = region.distance(points[at] + little * step)[1]
+    # In space a neighbour may lie on the same edge: its normal is that of no side.
+    side[(dim == 3) & (np.einsum("md,md->m", side, normals[near[at, which]]) < _SMOOTH)] = 0.0
+    total = np.zeros(points.shape)
+    np.add.at(total, at, side)
+    length = np.linalg.norm(total, axis=1, keepdims=True)
+    return np.where(length > 0, total / np.where(length > 0, length, 1.0), normals)
 
 
 def _grouped(points: np.ndarray, groups: Mapping[str, Predicate]) -> dict[str, np.ndarray]:

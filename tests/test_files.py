@@ -2,6 +2,7 @@
 
 import builtins
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -90,6 +91,57 @@ def test_gmsh_file_with_physical_names(tmp_path):
     np.testing.assert_allclose(cloud.normals[cloud.groups["bottom"]][1], [0, -1])
     # In memory "right" is named first.
     assert from_mesh(mesh).points[from_mesh(mesh).groups["right"]].tolist() == [[2, 0], [2, 1], [2, 2]]
+
+
+def ring():
+    """A quarter of a ring between the radii 1 and 2, its four sides tagged; the arcs first, so that corners are theirs."""
+    radius, angle = np.linspace(1, 2, 9), np.linspace(0, np.pi / 2, 17)
+    points = np.array([[r * np.cos(t), r * np.sin(t), 0] for r in radius for t in angle])
+    at = np.arange(points.shape[0]).reshape(9, 17)
+    quads = np.stack([at[:-1, :-1], at[1:, :-1], at[1:, 1:], at[:-1, 1:]], axis=-1).reshape(-1, 4)
+    sides = {"hole": at[0], "rim": at[-1], "bottom": at[:, 0], "left": at[:, -1]}
+    lines = [np.stack([side[:-1], side[1:]], axis=1) for side in sides.values()]
+    tags = np.repeat(np.arange(1, 5), [len(line) for line in lines])
+    return meshio.Mesh(points, [("quad", quads), ("line", np.concatenate(lines))],
+                       cell_data={"gmsh:physical": [np.full(len(quads), 9), tags]},
+                       field_data={name: np.array([k + 1, 1]) for k, name in enumerate(sides)})  # fmt: skip
+
+
+def test_at_corners_between_groups_the_normal_is_that_of_the_own_side():
+    """Mesh normals of regular arcs are the circle's, to their very ends: not the bisectors of the corners there."""
+    cloud = from_mesh(ring())
+    for name, outward in (("hole", lambda x: -x), ("rim", lambda x: x / 2), ("bottom", lambda x: [0, -1]),
+                          ("left", lambda x: [-1, 0])):  # fmt: skip
+        wanted = np.array([outward(x) for x in cloud.points[cloud.groups[name]]])
+        np.testing.assert_allclose(cloud.normals[cloud.groups[name]], wanted, atol=1e-14)
+
+
+def test_a_ring_under_pressure_from_a_mesh():
+    """Lame's thick-walled tube in plane strain: u = a r + b / r, pressure inside, nothing outside, two planes of symmetry."""
+    mu = lam = 1.0
+    pressure, cloud = 0.3, from_mesh(ring())
+
+    def stress(u, x):
+        slope = js.grad(u)(x)
+        return lam * jnp.trace(slope) * jnp.eye(2) + mu * (slope + slope.T)
+
+    def sheared(u, x, n):
+        return stress(u, x)[0, 1]
+
+    problem = js.Problem(
+        lambda u, x: js.divergence(lambda y: stress(u, y))(x),
+        {
+            "hole": js.condition(lambda u, x, n: stress(u, x) @ n + pressure * n),
+            "rim": js.condition(lambda u, x, n: stress(u, x) @ n),
+            "bottom": [js.dirichlet(0.0, field=1), js.condition(sheared)],
+            "left": [js.dirichlet(0.0, field=0), js.condition(sheared)],
+        },
+        fields=2,
+    )
+    square = (cloud.points**2).sum(axis=1, keepdims=True)
+    a, b = pressure / 3 / (2 * (lam + mu)), pressure * 4 / 3 / (2 * mu)  # radii 1 and 2
+    exact = (a + b / square) * cloud.points
+    assert abs(js.solve(problem, cloud, order=6).u - exact).max() < 1e-3 * abs(exact).max()
 
 
 def test_cell_sets_point_sets_and_a_chosen_tag():

@@ -205,10 +205,28 @@ def test_reprs_are_short(solution):
     kernel = js.SuperGaussian(np.full(12, 0.1), 3.0)
     things = (
         solution, CLOUD, PROBLEM, kernel, js.stencils(CLOUD, size=5), js.dirichlet(np.zeros(1000)), js.free(),
-        js.quality(CLOUD), js.factorize(PROBLEM, CLOUD),
+        js.quality(CLOUD), js.factorize(PROBLEM, CLOUD), js.fix(np.arange(1000), 0.0), js.periodic("left", "right"),
+        js.quadrature(CLOUD, "left"), js.Problem(residual, PROBLEM.bcs),
     )  # fmt: skip
     for thing in things:
         assert len(repr(thing)) < 200 and "\n" not in repr(thing), repr(thing)
+
+
+def residual(u, x):
+    return js.laplacian(u)(x)
+
+
+def test_what_can_be_pickled_and_what_says_that_it_cannot():
+    things = (
+        CLOUD, js.Problem(residual, {"left": js.dirichlet(1.0)}), js.Wendland(np.full(12, 0.1), 3.0),
+        js.stencils(CLOUD, size=5), js.robin(1.0, np.ones(3), 0.0), js.quality(CLOUD),
+    )  # fmt: skip
+    for thing in things:
+        back = pickle.loads(pickle.dumps(thing))
+        assert repr(back) == repr(thing)
+        jax.tree.map(np.testing.assert_array_equal, jax.tree.leaves(back), jax.tree.leaves(thing))
+    with pytest.raises(TypeError, match="call js.factorize again"):
+        pickle.dumps(js.factorize(PROBLEM, CLOUD))
 
 
 # ------------------------------------------------------------------ compilations

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+import jsmitsm as js
 from jsmitsm import clouds, sdf
 from jsmitsm.shapes import from_polygon, from_sdf, quality
 
@@ -111,6 +112,34 @@ def test_corners_are_particles_with_bisectors(built):
         k = np.linalg.norm(cloud.points - vertex, axis=1).argmin()
         np.testing.assert_allclose(cloud.points[k], vertex, atol=1e-12)
         np.testing.assert_allclose(cloud.normals[k], np.divide(bisector, np.sqrt(2)), atol=1e-7)
+
+
+@pytest.mark.parametrize("make", ["sdf", "polygon"])
+def test_at_corners_between_groups_the_normal_is_that_of_the_own_side(make):
+    """A flux on a side holds to its end: with bisectors at its corners u would be 3 % wrong, and no flag would say so."""
+    groups = {"flux": lambda x: x[:, 0] < 1e-9, "held": lambda x: x[:, 0] > -1}
+    square = [(0, 0), (1, 0), (1, 1), (0, 1)]
+    cloud = (from_polygon(square, 0.1, groups=groups) if make == "polygon"
+             else from_sdf(sdf.rectangle((0, 0), (1, 1)), ((0, 0), (1, 1)), 0.1, groups=groups))  # fmt: skip
+    np.testing.assert_allclose(cloud.normals[cloud.groups["flux"]], [[-1, 0]] * len(cloud.groups["flux"]), atol=1e-9)
+    exact = lambda x: jnp.exp(x[0]) * jnp.sin(x[1] + 0.3)
+    conditions = {"flux": js.neumann(lambda x: -exact(x)), "held": js.dirichlet(exact)}
+    sol = js.solve(js.Problem(lambda u, x: js.laplacian(u)(x), conditions), cloud)
+    assert abs(sol.u - jax.vmap(exact)(cloud.points)).max() < 1e-5
+
+
+def test_edges_between_groups_in_space_and_on_curved_sides():
+    """The flat end of a cylinder against its wall: either group has its own normals on the rim, the wall's are curved."""
+    pipe = sdf.cylinder((0, 0, 0), (0, 0, 1), 0.5)
+    ends = lambda x: np.abs(x[:, 2] - 0.5) > 0.5 - 1e-9
+    wall = lambda x: np.linalg.norm(x[:, :2], axis=1) > 0.5 - 1e-9
+    for groups in ({"ends": ends, "wall": wall}, {"wall": wall, "ends": ends}):
+        cloud = from_sdf(pipe, ((-0.5, -0.5, 0), (0.5, 0.5, 1)), 0.13, groups=groups)
+        x = cloud.points[cloud.groups["wall"]]
+        wanted = np.pad(x[:, :2] / np.linalg.norm(x[:, :2], axis=1, keepdims=True), ((0, 0), (0, 1)))
+        np.testing.assert_allclose(cloud.normals[cloud.groups["wall"]], wanted, atol=1e-6)
+        end = cloud.groups["ends"]
+        np.testing.assert_allclose(cloud.normals[end], np.sign(cloud.points[end, 2:] - 0.5) * [0, 0, 1], atol=1e-6)
 
 
 @pytest.mark.parametrize("sign", [1, -1])
