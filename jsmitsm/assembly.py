@@ -205,6 +205,23 @@ def _tests(scheme: Scheme, near: Support) -> Any:
 
 
 @_in_size_classes
+def moment_matrices(
+    scheme: Scheme, points: Any, kernel: Kernel | None, ids: Any, neighbours: Any, operands: Operands,
+    each: tuple = (), whole: tuple = (),
+) -> Any:  # fmt: skip
+    """The moment matrices (n, rows, free) of the particles ``ids``, in the last stage of I and II."""
+
+    def particle(i, near_ids, jac, own):
+        near, solution, own, data, tests = _prepared(scheme, points, kernel, i, near_ids, operands, jac, own)
+        if scheme.method in ("I", "II"):
+            return moments.moment_matrix(closure.closing_system(scheme, near, solution, own))
+        skip_self = scheme.method != "SSPH"
+        return moments.moment_matrix(moments.local_system(scheme, near, solution, own, data, tests, skip_self))
+
+    return _mapped(particle, ids, neighbours, operands)
+
+
+@_in_size_classes
 def recoveries(
     scheme: Scheme, points: Any, kernel: Kernel, ids: Any, neighbours: Any, operands: Operands,
     each: tuple[Any, Any], whole: tuple = (),

@@ -27,7 +27,7 @@ import numpy as np
 
 from jsmitsm import jets
 from jsmitsm.kernels import Kernel
-from jsmitsm.moments import Elimination, Scheme, Support, functional, local_system
+from jsmitsm.moments import Elimination, Scheme, Support, System, functional, local_system
 from jsmitsm.polynomials import derivative_table, monomials
 from jsmitsm.series import variable
 from jsmitsm.taylor import factorial, index_of, multi_indices
@@ -153,14 +153,19 @@ class Closing(NamedTuple):
 def closing(scheme: Scheme, near: Support, solution: Elimination, own: Any) -> Closing:
     """The particle's row of method I or II over its neighbours' free Taylor coefficients."""
     n = len(scheme.free)
-    values = derivative_rows(scheme, near).reshape(-1, scheme.rec.size)
-    tests = tests_i_ii(scheme, near).reshape(-1, n)
-    system = local_system(scheme, near, solution, own, None, tests, skip_self=True, values=values)
+    system = closing_system(scheme, near, solution, own)
     wanted = jnp.zeros((1, scheme.rec.size)).at[0, 0].set(1.0)
     w, v, v_own, defect = functional(scheme, near, system, wanted)
     free = free_multi_indices(scheme)
     lift = near.length ** np.array([float(sum(b)) for b in free]) * np.array([float(factorial(b)) for b in free])
     return Closing(w.reshape(-1, n) * lift, v[:, 0] * solution.lift, v_own[:, 0] * system.own_scale, defect)
+
+
+def closing_system(scheme: Scheme, near: Support, solution: Elimination, own: Any) -> System:
+    """The moment system of a row of method I or II, whose data are the neighbours' derivatives."""
+    values = derivative_rows(scheme, near).reshape(-1, scheme.rec.size)
+    tests = tests_i_ii(scheme, near).reshape(-1, len(scheme.free))
+    return local_system(scheme, near, solution, own, None, tests, skip_self=True, values=values)
 
 
 def composed(near_ids: Any, row: Closing, far_ids: Any, recovered: Recovery, reach: Any) -> tuple[Any, Any]:

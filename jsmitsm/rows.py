@@ -219,6 +219,12 @@ def class_rows(disc: Discretization, nums: Numbers, cls: Class, shared: Any) -> 
     return _joined(each("local fits", one, pieces(disc, nums, cls), _shared_out("rows", disc, cls)))
 
 
+def class_moment_matrices(disc: Discretization, nums: Numbers, cls: Class, shared: Any) -> Any:
+    """The moment matrices (n, rows, free) of one class of particles."""
+    given = operands(disc, nums, cls.ids, cls.scheme, shared)
+    return assembly.moment_matrices(cls.scheme, disc.points, disc.kernel, cls.ids, cls.neighbours, given)
+
+
 def class_coefficients(disc: Discretization, nums: Numbers, cls: Class, shared: Any, u: Any) -> Any:
     """Taylor coefficients (n, F, K) of one class of particles from all values u (N, F)."""
     whole = (disc.images.extend_values(u), disc.images.extend_values(nums.gamma))

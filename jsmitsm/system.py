@@ -203,6 +203,13 @@ class Run:
         dz.least_squares(self.disc, self.nums, fits)
         return dz.misfit(self.disc, self.nums, fits, self.values)
 
+    def condition_numbers(self) -> tuple[np.ndarray, float]:
+        """Of the particles' moment matrices (N,), and of the global system, NaN where it was solved by iteration."""
+        if self.nums is None:
+            raise ValueError("condition_numbers: the solve failed before it had a system; see diagnose()")
+        whole = np.nan if self.factor is None else linsolve.condition_estimate(self.factor)
+        return health.condition_numbers(self.disc, self.nums), float(whole)
+
     def flags(self) -> list[str]:
         """What speaks against the solution, in sentences; see :mod:`jsmitsm.flags`."""
         failed = [m for m in self.messages if m.startswith("FAILED")]
