@@ -256,9 +256,12 @@ def closed_rows(
         made = closure.closing(scheme, near, solution, own)
         weights, more = closure.composed(near_ids, made, far_ids, recovered, reach)
         size = jnp.sum(jnp.abs(weights))
+        # A row is not determined where the recovery of a neighbour is not; rounding there averages out.
+        missed = jnp.max(jnp.where(near.inside, recovered.defect[jnp.maximum(near_ids, 0)], 0.0))
+        missed = jnp.where(missed > jnp.sqrt(jnp.finfo(missed.dtype).eps), missed, 0.0)
         return Row(
             weights[None, :, None], jnp.zeros((1, reach.shape[0], 0)), made.source[None], made.condition[None],
-            size[None], made.defect, more[None],
+            size[None], jnp.maximum(made.defect, missed), more[None],
         )  # fmt: skip
 
     return _mapped(particle, ids, neighbours, operands, *each)

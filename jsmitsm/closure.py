@@ -115,6 +115,7 @@ class Recovery(NamedTuple):
     weights: Any  # (free, ns)
     own: Any  # (free,) of the particle's own value
     constant: Any  # (free,) from the source and the particle's conditions
+    defect: Any  # (), how far its moment system is from determining them
 
 
 def recover(scheme: Scheme, near: Support, solution: Elimination, own: Any, source: Any, given: Any) -> Recovery:
@@ -132,13 +133,13 @@ def recover(scheme: Scheme, near: Support, solution: Elimination, own: Any, sour
     system = local_system(held, near, solution, rows, None, None, skip_self=True)
     wanted = np.zeros((len(scheme.free), scheme.rec.size))
     wanted[np.arange(len(scheme.free)), np.array(scheme.free)] = 1.0
-    w, v, v_own, _ = functional(held, near, system, jnp.asarray(wanted))
+    w, v, v_own, defect = functional(held, near, system, jnp.asarray(wanted))
     scale = near.length ** -np.array([float(sum(a)) for a in free_multi_indices(scheme)])
     v_own = v_own * system.own_scale[:, None]
     constant = (solution.lift * source) @ v
     if scheme.n_own:
         constant = constant + given @ v_own[1:]
-    return Recovery((w * scale).T, v_own[0] * scale, constant * scale)
+    return Recovery((w * scale).T, v_own[0] * scale, constant * scale, defect)
 
 
 class Closing(NamedTuple):
