@@ -12,13 +12,14 @@ from __future__ import annotations
 import os
 import threading
 import time
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
 
 from jsmitsm.backends import BACKENDS, ITERATIVE, SuperLU, installed
 from jsmitsm.errors import SolveError
+from jsmitsm.interrupts import interruptible
 from jsmitsm.ordering import nested_dissection
 from jsmitsm.progress import bar
 from jsmitsm.threads import cores
@@ -35,6 +36,8 @@ PARDISO_MIN = {2: 200_000, 3: 2_000}
 BACKWARD_ERROR = 1e-9  # what is accepted of a direct solver
 BACKWARD_ERROR_ITERATIVE = 1e-12  # of an iterative one, which reaches round-off unless it stalls
 SINGULAR = 1e15  # condition number (scaled) above which no digit of a solution means anything
+# Unknowns from which a factorisation may take seconds: a thread costs less than a millisecond.
+LONG = 10_000
 COUNTS = {"factorisations": 0}
 
 
@@ -253,7 +256,8 @@ class Factor:
         COUNTS["factorisations"] += 1
         try:
             with bar(f"{backend} on {self.n} unknowns"):
-                self._lu = BACKENDS[backend](self.matrix)
+                make = partial(BACKENDS[backend], self.matrix)
+                self._lu = interruptible(make) if self.n > LONG else make()
         except (RuntimeError, ValueError, np.linalg.LinAlgError) as error:
             if self._give_way(f"failed ({error})"):
                 return
