@@ -6,7 +6,7 @@ import sys
 PROMPT = 3.0  # seconds, some ten times what it takes
 
 CHILD = """
-import os, signal, threading, time
+import os, signal, sys, threading, time
 import jax
 jax.config.update("jax_enable_x64", True)
 import jax.numpy as jnp
@@ -16,7 +16,7 @@ import jsmitsm as js
 SIDES = ("left", "right", "bottom", "top")
 exact = lambda x: jnp.exp(x[0]) * jnp.sin(x[1])
 problem = js.Problem(lambda u, x: js.laplacian(u)(x), {s: js.dirichlet(exact) for s in SIDES})
-small, large = (js.rectangle((0, 0), (1, 1), (n, n), jitter=0.2) for n in (11, 200))
+small, large = (js.rectangle((0, 0), (1, 1), (n, n), jitter=0.2) for n in (11, 250))
 
 
 def right():
@@ -37,16 +37,18 @@ def interrupted(call, after):
     raise AssertionError("it ended before it was interrupted")
 
 
-# Compiled before: jaxlib, interrupted in a compilation, may crash when the process ends.
+# Compiled before: that takes longer than all else.
 kernel = js.SuperGaussian(h=0.1, d=3.5)
 js.solve(problem, large), js.tune(problem, small, kernel, steps=2), right()
 js.linsolve.clear_cache()
-print("solve", interrupted(lambda: js.solve(problem, large), 0.3))
+print("solve", interrupted(lambda: js.solve(problem, large), 0.1))
 right()
 # Stands for a factorisation, during which Python does not look at signals.
 print("factorisation", interrupted(lambda: js.interrupts.interruptible(lambda: time.sleep(20)), 0.3))
 print("tune", interrupted(lambda: js.tune(problem, small, kernel, steps=10**5), 1.0))
 right()
+sys.stdout.flush()
+os._exit(0)  # jaxlib 0.10.2, once interrupted in a compilation, may crash when the interpreter ends
 """
 
 
