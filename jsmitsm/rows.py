@@ -229,7 +229,7 @@ def class_rows(disc: Discretization, nums: Numbers, cls: Class, shared: Any) -> 
 
 def class_moment_matrices(disc: Discretization, nums: Numbers, cls: Class, shared: Any) -> Any:
     """The moment matrices (n, rows, free) of one class of particles."""
-    given = operands(disc, nums, cls.ids, cls.scheme, shared)
+    given = operands(disc, nums, cls, shared)
     return assembly.moment_matrices(cls.scheme, disc.points, disc.kernel, cls.ids, cls.neighbours, given)
 
 
