@@ -205,6 +205,23 @@ def _tests(scheme: Scheme, near: Support) -> Any:
 
 
 @_in_size_classes
+def moment_matrices(
+    scheme: Scheme, points: Any, kernel: Kernel | None, ids: Any, neighbours: Any, operands: Operands,
+    each: tuple = (), whole: tuple = (),
+) -> Any:  # fmt: skip
+    """The moment matrices (n, rows, free) of the particles ``ids``, in the last stage of I and II."""
+
+    def particle(i, near_ids, jac, own):
+        near, solution, own, data, tests = _prepared(scheme, points, kernel, i, near_ids, operands, jac, own)
+        if scheme.method in ("I", "II"):
+            return moments.moment_matrix(closure.closing_system(scheme, near, solution, own))
+        skip_self = scheme.method != "SSPH"
+        return moments.moment_matrix(moments.local_system(scheme, near, solution, own, data, tests, skip_self))
+
+    return _mapped(particle, ids, neighbours, operands)
+
+
+@_in_size_classes
 def recoveries(
     scheme: Scheme, points: Any, kernel: Kernel, ids: Any, neighbours: Any, operands: Operands,
     each: tuple[Any, Any], whole: tuple = (),
@@ -239,9 +256,12 @@ def closed_rows(
         made = closure.closing(scheme, near, solution, own)
         weights, more = closure.composed(near_ids, made, far_ids, recovered, reach)
         size = jnp.sum(jnp.abs(weights))
+        # A row is not determined where the recovery of a neighbour is not; rounding there averages out.
+        missed = jnp.max(jnp.where(near.inside, recovered.defect[jnp.maximum(near_ids, 0)], 0.0))
+        missed = jnp.where(missed > jnp.sqrt(jnp.finfo(missed.dtype).eps), missed, 0.0)
         return Row(
             weights[None, :, None], jnp.zeros((1, reach.shape[0], 0)), made.source[None], made.condition[None],
-            size[None], made.defect, more[None],
+            size[None], jnp.maximum(made.defect, missed), more[None],
         )  # fmt: skip
 
     return _mapped(particle, ids, neighbours, operands, *each)

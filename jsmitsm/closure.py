@@ -27,7 +27,7 @@ import numpy as np
 
 from jsmitsm import jets
 from jsmitsm.kernels import Kernel
-from jsmitsm.moments import Elimination, Scheme, Support, functional, local_system
+from jsmitsm.moments import Elimination, Scheme, Support, System, functional, local_system
 from jsmitsm.polynomials import derivative_table, monomials
 from jsmitsm.series import variable
 from jsmitsm.taylor import factorial, index_of, multi_indices
@@ -115,6 +115,7 @@ class Recovery(NamedTuple):
     weights: Any  # (free, ns)
     own: Any  # (free,) of the particle's own value
     constant: Any  # (free,) from the source and the particle's conditions
+    defect: Any  # (), how far its moment system is from determining them
 
 
 def recover(scheme: Scheme, near: Support, solution: Elimination, own: Any, source: Any, given: Any) -> Recovery:
@@ -132,13 +133,13 @@ def recover(scheme: Scheme, near: Support, solution: Elimination, own: Any, sour
     system = local_system(held, near, solution, rows, None, None, skip_self=True)
     wanted = np.zeros((len(scheme.free), scheme.rec.size))
     wanted[np.arange(len(scheme.free)), np.array(scheme.free)] = 1.0
-    w, v, v_own, _ = functional(held, near, system, jnp.asarray(wanted))
+    w, v, v_own, defect = functional(held, near, system, jnp.asarray(wanted))
     scale = near.length ** -np.array([float(sum(a)) for a in free_multi_indices(scheme)])
     v_own = v_own * system.own_scale[:, None]
     constant = (solution.lift * source) @ v
     if scheme.n_own:
         constant = constant + given @ v_own[1:]
-    return Recovery((w * scale).T, v_own[0] * scale, constant * scale)
+    return Recovery((w * scale).T, v_own[0] * scale, constant * scale, defect)
 
 
 class Closing(NamedTuple):
@@ -153,14 +154,19 @@ class Closing(NamedTuple):
 def closing(scheme: Scheme, near: Support, solution: Elimination, own: Any) -> Closing:
     """The particle's row of method I or II over its neighbours' free Taylor coefficients."""
     n = len(scheme.free)
-    values = derivative_rows(scheme, near).reshape(-1, scheme.rec.size)
-    tests = tests_i_ii(scheme, near).reshape(-1, n)
-    system = local_system(scheme, near, solution, own, None, tests, skip_self=True, values=values)
+    system = closing_system(scheme, near, solution, own)
     wanted = jnp.zeros((1, scheme.rec.size)).at[0, 0].set(1.0)
     w, v, v_own, defect = functional(scheme, near, system, wanted)
     free = free_multi_indices(scheme)
     lift = near.length ** np.array([float(sum(b)) for b in free]) * np.array([float(factorial(b)) for b in free])
     return Closing(w.reshape(-1, n) * lift, v[:, 0] * solution.lift, v_own[:, 0] * system.own_scale, defect)
+
+
+def closing_system(scheme: Scheme, near: Support, solution: Elimination, own: Any) -> System:
+    """The moment system of a row of method I or II, whose data are the neighbours' derivatives."""
+    values = derivative_rows(scheme, near).reshape(-1, scheme.rec.size)
+    tests = tests_i_ii(scheme, near).reshape(-1, len(scheme.free))
+    return local_system(scheme, near, solution, own, None, tests, skip_self=True, values=values)
 
 
 def composed(near_ids: Any, row: Closing, far_ids: Any, recovered: Recovery, reach: Any) -> tuple[Any, Any]:

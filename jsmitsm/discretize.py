@@ -17,7 +17,7 @@ from jsmitsm.globalsystem import (
 )
 from jsmitsm.layout import Class, Discretization, default_size, discretize, scheme_size, sorted_classes, table
 from jsmitsm.numbers import Numbers, numbers
-from jsmitsm.rows import all_coefficients, all_rows, class_rows, shared_elimination
+from jsmitsm.rows import all_coefficients, all_rows, class_moment_matrices, class_rows, shared_elimination
 
 __all__ = [
     "Class",
@@ -26,6 +26,7 @@ __all__ = [
     "all_coefficients",
     "all_rows",
     "cell_peclet",
+    "class_moment_matrices",
     "class_rows",
     "default_size",
     "discretize",

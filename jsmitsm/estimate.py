@@ -162,7 +162,7 @@ class Factorization:
         run.rows, run.nums, run.values = (self._classes, self._rows), nums, np.asarray(values)
         recipe = Recipe(disc.scheme.method, disc.rec.order, None, "loo", problem.fields)
         fit = Fit(problem, disc.cloud, disc.kernel, dz.table(disc), None, recipe)
-        return Solution(values, disc.cloud, recipe, fit, good, 1, run.stats(), report=run.flags)
+        return Solution(values, disc.cloud, recipe, fit, good, 1, run.stats(), report=run)
 
     def __reduce__(self):
         raise TypeError(

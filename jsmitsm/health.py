@@ -99,6 +99,41 @@ def repaired(
     return new_classes, new_rows, replace(after, repaired=fixed)
 
 
+# Moment matrices are looked at so many at a time, as many as one small program serves.
+_PIECE = 128
+
+
+def condition_numbers(disc: Discretization, nums: Numbers) -> np.ndarray:
+    """The condition number (N,) of every particle's moment matrix; NaN where all values are held.
+
+    That of the matrix with its rows and columns brought to unit length: units and the scaling of
+    single coefficients do not count. It says how many digits a row may lose, and does not predict
+    how well its stencil predicts the particle: the Lebesgue constant does.
+    """
+    shared = dz.shared_elimination(disc, nums)
+    out = np.full(len(disc.cloud), np.nan)
+    for cls in disc.classes:
+        for k in range(0, len(cls.ids), _PIECE):
+            piece = Class(cls.ids[k : k + _PIECE], cls.neighbours[k : k + _PIECE], cls.scheme)
+            out[piece.ids] = _conditions(np.asarray(dz.class_moment_matrices(disc, nums, piece, shared), float))
+    return out
+
+
+def _conditions(matrices: np.ndarray) -> np.ndarray:
+    """Condition numbers (n,) of matrices (n, rows, columns), scaled; infinite where one is not finite."""
+    finite = np.isfinite(matrices).all(axis=(1, 2))
+    scaled = np.where(finite[:, None, None], matrices, 0.0)
+    axes = (2, 1) if matrices.shape[1] == matrices.shape[2] else (1,)  # rows of a fit carry the weights
+    for axis in axes:
+        size = np.linalg.norm(scaled, axis=axis, keepdims=True)
+        scaled = scaled / np.where(size > 0, size, 1.0)
+    values = np.linalg.svd(scaled, compute_uv=False)
+    if not values.shape[1]:  # nothing is left to fit
+        return np.ones(len(matrices))
+    smallest = values[:, -1]
+    return np.where(finite & (smallest > 0), values[:, 0] / np.where(smallest > 0, smallest, 1.0), np.inf)
+
+
 def _score(row: Row) -> np.ndarray:
     lebesgue, defect = _worst(row)
     return np.where(np.isfinite(lebesgue) & (defect < _most(row)), lebesgue, np.inf)

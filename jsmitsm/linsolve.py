@@ -31,6 +31,7 @@ from jsmitsm.sparse import (
     condition_estimate,
     estimate_memory,
     near_null_vector,
+    refuse_too_large,
 )
 
 __all__ = [
@@ -42,6 +43,7 @@ __all__ = [
     "factor",
     "factorisations",
     "near_null_vector",
+    "refuse_too_large",
     "solve",
 ]
 

@@ -247,6 +247,13 @@ def local_system(
     return System(solution, basis, own_rows, own_scale, own_solve, values, phi, weights, tests, data_scale)
 
 
+def moment_matrix(system: System) -> Any:
+    """What is inverted: sqrt(W) phi (data, free) for a least-squares fit, else tests^T phi (free, free)."""
+    if system.tests is None:
+        return safe_root(system.weight)[:, None] * system.phi
+    return system.tests.T @ system.phi
+
+
 def functional(scheme: Scheme, near: Support, system: System, wanted: Any) -> tuple[Any, Any, Any, Any]:
     """Weights of the data, the source and the own conditions in ``wanted`` (m, F K) . U.
 

@@ -166,6 +166,11 @@ def _pattern(near: np.ndarray, n: int) -> Any:
     return csr_matrix((np.ones(len(i), np.float32), (i, near[i, k])), (n, n))
 
 
+# Smoothing lengths at which a Gauss function has fallen to 1e-4: a fit without LAPACK forms its normal
+# equations, which in float32 cannot use much less.
+_FAR = 3.0
+
+
 def _recovery_kernel(disc: Discretization) -> tuple[Kernel, Any]:
     """The kernel of stage 1 and its neighbours: wide enough to hold 1.5 times the free coefficients."""
     points, kernel, near = disc.points, disc.kernel, disc.stencils.indices
@@ -181,8 +186,11 @@ def _recovery_kernel(disc: Discretization) -> tuple[Kernel, Any]:
         near = None
         reach = nearest(np.asarray(points), min(count, len(points))).radius
     xp = jnp if is_traced(reach, kernel) else np
-    wide = kernel.replace(h=xp.maximum(kernel.h, reach / (0.9 * kernel.d)))
-    return wide, within(np.asarray(points), wide.h * np.asarray(kernel.d)).indices if near is None else near
+    # Inside the support, and where the weight is not yet lost to rounding.
+    wide = kernel.replace(h=xp.maximum(kernel.h, reach / xp.minimum(0.9 * kernel.d, _FAR)))
+    if near is None:
+        near = within(np.asarray(points), np.maximum(kernel.h * np.asarray(kernel.d), reach / 0.9)).indices
+    return wide, near
 
 
 def pieces(disc: Discretization, nums: Numbers, cls: Class, *more: Any) -> list[Class]:
@@ -217,6 +225,12 @@ def class_rows(disc: Discretization, nums: Numbers, cls: Class, shared: Any) -> 
         return assembly.rows(cls.scheme, disc.points, disc.kernel, cls.ids, cls.neighbours, given)
 
     return _joined(each("local fits", one, pieces(disc, nums, cls), _shared_out("rows", disc, cls)))
+
+
+def class_moment_matrices(disc: Discretization, nums: Numbers, cls: Class, shared: Any) -> Any:
+    """The moment matrices (n, rows, free) of one class of particles."""
+    given = operands(disc, nums, cls, shared)
+    return assembly.moment_matrices(cls.scheme, disc.points, disc.kernel, cls.ids, cls.neighbours, given)
 
 
 def class_coefficients(disc: Discretization, nums: Numbers, cls: Class, shared: Any, u: Any) -> Any:

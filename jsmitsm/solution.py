@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -29,6 +28,14 @@ class Recipe:
     basis_terms: int | None
     formulation: str
     fields: int
+
+
+class Report(Protocol):
+    """What the solve can still say of itself when asked."""
+
+    def flags(self) -> list[str]: ...
+
+    def condition_numbers(self) -> tuple[np.ndarray, float]: ...
 
 
 @jax.tree_util.register_pytree_node_class
@@ -70,7 +77,7 @@ class Solution:
         self.converged = converged
         self.iterations = iterations
         self.stats: dict[str, Any] = stats
-        self._report: Callable[[], list[str]] | None = report
+        self._report: Report | None = report
         self._found: list[str] | None = None  # what the report said
         self._share = 0.0  # estimated error over solution
 
@@ -187,9 +194,25 @@ class Solution:
         asked for before. No flag is no proof; the error estimate sees more.
         """
         if self._found is None and self._report is not None:
-            self._found = self._report()
+            self._found = self._report.flags()
         large = f"The estimated error is {self._share:.0%} of the solution: refine the cloud, or change the order."
         return [*(self._found or []), *([] if self._share <= LARGE else [large])]
+
+    def condition_numbers(self) -> tuple[Any, float]:
+        """The condition number (N,) of every particle's moment matrix, and an estimate of the global system's.
+
+        The matrices are those with rows and columns scaled to about one, so that units do not count.
+        NaN for particles whose values are held, and for a system solved by iteration. They say how
+        many digits round-off may take; they do not predict the error: the Lebesgue constants do more.
+
+        Raises ValueError for a solution that was pickled or made under ``jax.jit``.
+        """
+        if self._report is None:
+            raise ValueError(
+                "condition_numbers: this solution was pickled or made by a JAX transform, and its systems are gone; "
+                "solve outside and ask before pickling"
+            )
+        return self._report.condition_numbers()
 
     def diagnose(self) -> str:
         """In words: how the solve went, which particles were weak and what was done."""

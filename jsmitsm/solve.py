@@ -130,7 +130,7 @@ def solve(
     run.seconds["total"] = time.perf_counter() - start
     recipe = Recipe(method, order, basis_terms, run.formulation, problem.fields)
     fit = Fit(problem, cloud, disc.kernel, dz.table(disc), taylor, recipe)
-    report = None if is_traced(values) else run.flags
+    report = None if is_traced(values) else run
     return Solution(values, cloud, recipe, fit, good, iterations, run.stats(), report=report)
 
 

@@ -38,10 +38,24 @@ class Run:
         self.linear: dict[str, Any] = {}
         self.health: health.Health | None = None
         self.imbalance = np.inf  # of a floating field's data, once solved: the mean residual relative to them
+        self._refuse_too_large()
         # What the last step leaves for the flags; nothing of it under a JAX transform.
         self.rows: tuple[list[Class], list[Row]] | None = None
         self.nums: Numbers | None = None
         self.values: np.ndarray | None = None
+
+    def _refuse_too_large(self) -> None:
+        """What will not fit in memory is refused before it is made."""
+        disc = self.disc
+        near, fields = disc.stencils.indices, disc.rec.fields
+        if is_traced(near, disc.cloud.points):
+            return
+        n, width = int((~disc.held).sum()), fields * int(np.shape(near)[1])
+        if disc.scheme.method in ("I", "II"):  # neighbours of neighbours
+            width *= 4
+        if self.formulation == "lsq":  # a square block for every particle
+            width *= width
+        linsolve.refuse_too_large(n, n * width, np.asarray(disc.cloud.points), self.solver, fields == 1)
 
     def local_rows(self, nums: Numbers) -> tuple[list[Class], list[Row]]:
         """The rows of all classes, weak stencils repaired the first time."""
@@ -207,6 +221,13 @@ class Run:
         fits: list[Any] = []
         dz.least_squares(self.disc, self.nums, fits)
         return dz.misfit(self.disc, self.nums, fits, self.values)
+
+    def condition_numbers(self) -> tuple[np.ndarray, float]:
+        """Of the particles' moment matrices (N,), and of the global system, NaN where it was solved by iteration."""
+        if self.nums is None:
+            raise ValueError("condition_numbers: the solve failed before it had a system; see diagnose()")
+        whole = np.nan if self.factor is None else linsolve.condition_estimate(self.factor)
+        return health.condition_numbers(self.disc, self.nums), float(whole)
 
     def flags(self) -> list[str]:
         """What speaks against the solution, in sentences; see :mod:`jsmitsm.flags`."""

@@ -72,3 +72,29 @@ def test_a_factorisation_tells_too():
     spike = posed(laplace, lambda x: jnp.exp(-4000 * jnp.sum((x - 0.5) ** 2)))
     first, second = ready.solve(spike), ready.solve(posed(laplace, smooth))
     assert first.flags and second.flags == []  # asked for after the second solve
+
+
+@pytest.mark.parametrize("method", ["S", "I", "SSPH"])
+def test_condition_numbers_of_the_local_fits_and_of_the_whole(method):
+    """Against the matrices themselves: the global one, and that of a corner's neighbour in scaled monomials."""
+    cloud = square(9)
+    sol = js.solve(posed(laplace, smooth), cloud, method=method, order=2)
+    local, whole = sol.condition_numbers()
+    inside = cloud.groups["interior"]
+    assert np.isnan(local).sum() == len(cloud) - len(inside)
+    assert (local[inside] >= 1.0).all() and local[inside].max() < 10.0
+    factor = sol._report.factor
+    exact = np.linalg.cond(factor.matrix.toarray(), 1)
+    assert exact / 3.0 < whole <= exact * 1.001
+    if method == "SSPH":
+        return
+    with pytest.raises(ValueError, match="before pickling"):
+        pickle.loads(pickle.dumps(sol)).condition_numbers()
+
+
+def test_neighbours_on_a_line_have_a_condition_without_bound():
+    """In a box 1000 times as high as wide, neighbours differ across it only, and the other derivatives are all but free."""
+    thin = js.rectangle((0, 0), (1e-3, 1), (9, 9), jitter=0.2)
+    usual, bad = (js.solve(posed(laplace, smooth), c, method="SSPH", order=2).condition_numbers() for c in (square(9), thin))
+    inside = thin.groups["interior"]
+    assert bad[0][inside].max() > 100.0 * usual[0][inside].max()

@@ -108,3 +108,17 @@ def test_random_particles_on_a_line(seed):
     )
     np.testing.assert_allclose(sol.u, points[:, 0] ** 5, atol=1e-11)
     assert sol.stats["lebesgue_max"] < 1.5
+
+
+# ------------------------------------------------------------------ what does not fit in memory
+
+
+@pytest.mark.parametrize("solver, memory, words", [("auto", 1e6, "rows and the matrix"), ("sparse", 4e6, "direct solver")])
+def test_a_problem_that_will_not_fit_is_refused_before_its_rows_are_made(monkeypatch, solver, memory, words):
+    task, cloud = st.problem("poisson", 2, HOME), st.lattice(2, 0.2, shape=(45, 45))
+    made = []
+    monkeypatch.setattr(js.sparse, "_memory", lambda: memory)
+    monkeypatch.setattr(js.discretize, "all_rows", lambda *a: made.append(a))
+    with pytest.raises(js.SolveError, match=f"(?s){words}.*GB.*fewer particles"):
+        js.solve(task, cloud, solver=solver)
+    assert not made

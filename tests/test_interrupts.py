@@ -1,0 +1,61 @@
+"""Ctrl-C: a long solve and a long tune end at once, the user's program sees it, and the next solve is right."""
+
+import subprocess
+import sys
+
+PROMPT = 3.0  # seconds, some ten times what it takes
+
+CHILD = """
+import os, signal, sys, threading, time
+import jax
+jax.config.update("jax_enable_x64", True)
+import jax.numpy as jnp
+import numpy as np
+import jsmitsm as js
+
+SIDES = ("left", "right", "bottom", "top")
+exact = lambda x: jnp.exp(x[0]) * jnp.sin(x[1])
+problem = js.Problem(lambda u, x: js.laplacian(u)(x), {s: js.dirichlet(exact) for s in SIDES})
+small, large = (js.rectangle((0, 0), (1, 1), (n, n), jitter=0.2) for n in (11, 250))
+
+
+def right():
+    sol = js.solve(problem, small)
+    assert np.abs(sol.u - jax.vmap(exact)(small.points)).max() < 1e-5
+
+
+def interrupted(call, after):
+    sent = []
+    def press():
+        sent.append(time.perf_counter())
+        os.kill(os.getpid(), signal.SIGINT)
+    threading.Timer(after, press).start()
+    try:
+        call()
+    except KeyboardInterrupt:
+        return time.perf_counter() - sent[0]
+    raise AssertionError("it ended before it was interrupted")
+
+
+# Compiled before: that takes longer than all else.
+kernel = js.SuperGaussian(h=0.1, d=3.5)
+js.solve(problem, large), js.tune(problem, small, kernel, steps=2), right()
+js.linsolve.clear_cache()
+print("solve", interrupted(lambda: js.solve(problem, large), 0.1))
+right()
+# Stands for a factorisation, during which Python does not look at signals.
+print("factorisation", interrupted(lambda: js.interrupts.interruptible(lambda: time.sleep(20)), 0.3))
+print("tune", interrupted(lambda: js.tune(problem, small, kernel, steps=10**5), 1.0))
+right()
+sys.stdout.flush()
+os._exit(0)  # jaxlib 0.10.2, once interrupted in a compilation, may crash when the interpreter ends
+"""
+
+
+def test_ctrl_c_ends_a_solve_and_a_tune_at_once():
+    child = [sys.executable, "-c", CHILD]
+    done = subprocess.run(child, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr[-2000:]
+    waits = {line.split()[0]: float(line.split()[1]) for line in done.stdout.splitlines()}
+    assert set(waits) == {"solve", "factorisation", "tune"}
+    assert max(waits.values()) < PROMPT, waits
