@@ -87,6 +87,17 @@ def step(sparse: float = 0.12, ratio: float = 10.0, at: float = 0.75, seed: int 
     return sided(np.concatenate(parts), x, _line(0.0, 1.0, sparse), _line(0.0, 1.0, dense))
 
 
+def stepped_lattice(seed: int = 14) -> js.Cloud:
+    """The unit square with two slightly jittered lattices side by side, the right one ten times as fine."""
+    grid = lambda x, y: np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    coarse = grid(np.arange(0.04, 0.9, 0.08), np.arange(0.08, 0.95, 0.08))
+    dense = grid(np.arange(0.92, 0.999, 0.008), np.arange(0.008, 0.999, 0.008))
+    inside = np.concatenate([coarse, dense])
+    inside = inside + np.random.default_rng(seed).uniform(-0.001, 0.001, inside.shape)
+    t = np.linspace(0.0, 1.0, 31)
+    return sided(inside, t[1:-1], t, t)
+
+
 def cluster(
     sparse: float = 0.07, ratio: float = 10.0, centre: tuple[float, float] = (0.62, 0.43), radius: float = 0.12,
     seed: int = 13,

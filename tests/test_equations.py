@@ -19,7 +19,7 @@ LINEAR = [
     ("convection", 4), ("wave", 6), ("u_xy", 6), ("biharmonic", 4),
 ]  # fmt: skip
 SHAPES = [("star", 4), ("star mixed", 4), ("star neumann", 4), ("ball", 4), ("step", 4), ("step", 8), ("cluster", 6),
-          ("amoeba", 4)]  # fmt: skip
+          ("amoeba", 4), ("lattice step", 4)]  # fmt: skip
 NONLINEAR = [("bratu 1D", 8), ("quasilinear", 4), ("burgers", 4)]
 SYSTEMS = [
     ("elasticity", 4), ("kirsch", 6), ("cantilever", 4), ("stokes", 6), ("reaction-diffusion", 4), ("elasticity 3D", 4)

@@ -1,4 +1,4 @@
-"""No solve hangs, on one core or two: 200 of them, dense and sparse, plain and under jit.
+"""No solve hangs, on one core or two: 200 each, dense and sparse, plain, under jit and in pieces on all cores.
 
 Batched LAPACK calls and callbacks are known to wait for one another on machines with few cores.
 Every child is given its cores before JAX starts, and a time limit.
@@ -10,8 +10,8 @@ import sys
 
 import pytest
 
-SOLVES = 100
-LIMIT = 90.0  # seconds; a child takes 10 to 20 on an idle machine
+SOLVES = 200
+LIMIT = 120.0  # seconds; a child takes 10 to 20 on an idle machine
 
 CHILD = """
 import os, sys
@@ -35,22 +35,26 @@ def ready(n):
 
 
 small, large = ready(8), ready(17)  # 36 and 225 unknowns: LAPACK and the sparse solver
+huge = ready(95)  # more than a piece: the cores share its local fits
 largest = lambda q, task: js.solve(task[0].replace(params=q), task[1], stencils=task[2]).u.max()
 jitted = [jax.jit(lambda q, task=task: largest(q, task)) for task in (small, large)]
-done = 0
-for k in range({solves} // 4):
-    q = 0.1 * k
+done = k = 0
+while done < {solves}:
+    q, k = 0.05 * k, k + 1
     plain = [float(largest(q, task)) for task in (small, large)]
     compiled = [float(f(q)) for f in jitted]
     assert np.allclose(plain, compiled, rtol=1e-10), (plain, compiled)
     done += 4
+    if k % 5 == 0:
+        largest(q, huge)
+        done += 1
     print(done, flush=True)
 """
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="the system cannot bind a process to cores")
 @pytest.mark.parametrize("count", [1, 2])
-def test_a_hundred_solves_end(count):
+def test_two_hundred_solves_end(count):
     cores = sorted(os.sched_getaffinity(0))[:count]
     if len(cores) < count:
         pytest.skip(f"this process has {len(cores)} core(s)")
@@ -61,4 +65,4 @@ def test_a_hundred_solves_end(count):
         told = (late.stdout or b"").decode().split()
         pytest.fail(f"hung on {count} core(s) after {told[-1] if told else 0} of {SOLVES} solves")
     assert done.returncode == 0, done.stderr[-2000:]
-    assert done.stdout.split()[-1] == str(SOLVES)
+    assert int(done.stdout.split()[-1]) >= SOLVES

@@ -95,6 +95,8 @@ SHAPES = table(
         ceilings={2: 2e-3, 4: 2e-5, 6: 2e-7}, estimates=(2, 4, 6),
     ),
     scattered("step", "laplacian(u) = f, the density jumps 1:100", laplace, smooth, JUMPS, cloud=scenes.step),
+    scattered("lattice step", "laplacian(u) = f, lattices of spacing 10:1 side by side", laplace, smooth, {4: 1e-5},
+              cloud=scenes.stepped_lattice),
     scattered("cluster", "laplacian(u) = f, a cluster 100 times as dense", laplace, smooth, JUMPS, cloud=scenes.cluster),
     Case(
         "amoeba", "laplacian(u) = f on 5000 particles of an irregular domain", laplace, curved, scenes.amoeba,
