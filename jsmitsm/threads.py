@@ -9,7 +9,6 @@ from contextvars import copy_context
 from typing import Any
 
 import jax
-import jax.experimental
 
 
 def cores() -> int:
@@ -45,7 +44,9 @@ def _as_here(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
     """The function under the precision and the device of this thread, which JAX sets for each thread apart."""
     config: Any = jax.config
     wide, device = config.jax_enable_x64, config.jax_default_device
-    precision: Any = getattr(jax if hasattr(jax, "enable_x64") else jax.experimental, "enable_x64")  # noqa: B009
+    precision: Any = getattr(jax, "enable_x64", None)
+    if precision is None:  # JAX before 0.8
+        from jax.experimental import enable_x64 as precision
 
     def there(item: Any) -> Any:
         with precision(wide), jax.default_device(device):
