@@ -6,6 +6,7 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import copy_context
+from importlib import import_module
 from typing import Any
 
 import jax
@@ -46,7 +47,7 @@ def _as_here(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
     wide, device = config.jax_enable_x64, config.jax_default_device
     precision: Any = getattr(jax, "enable_x64", None)
     if precision is None:  # JAX before 0.8
-        from jax.experimental import enable_x64 as precision
+        precision = import_module("jax.experimental").enable_x64
 
     def there(item: Any) -> Any:
         with precision(wide), jax.default_device(device):
