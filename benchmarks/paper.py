@@ -72,7 +72,7 @@ class Job:
 
     def ready(self) -> Callable[[], js.Solution]:
         """The solve with everything before it done, so that a clock sees nothing else."""
-        cloud, problem = self.case.cloud(self.shape), self.case.problem()
+        cloud, problem = self.case.cloud(self.shape, jitter=0.0), self.case.problem()  # lattices, as the paper's
         near = None if self.reach is None else js.stencils(cloud, radius=self.reach * cloud.spacing)
         kernel = js.SuperGaussian(h=self.h * cloud.spacing, d=self.d)
         return lambda: js.solve(
