@@ -47,7 +47,7 @@ class _Bar:
         self._bar = tqdm(total=total, desc=what, delay=DELAY, mininterval=PAUSE, miniters=0, leave=False,
                          bar_format=form)  # fmt: skip
         self._lock, self._done = threading.Lock(), threading.Event()
-        self._clock = threading.Thread(target=self._tick, daemon=True)
+        self._clock = threading.Thread(target=self._tick, name=f"clock of {what}", daemon=True)
         self._clock.start()
 
     def _tick(self) -> None:
@@ -147,6 +147,8 @@ def watched() -> bool:
     """Whether a bar would be seen."""
     if "PYTEST_CURRENT_TEST" in os.environ or os.environ.get("TQDM_DISABLE", "0") != "0":
         return False
+    if threading.current_thread() is not threading.main_thread():
+        return False  # several at once would draw over one another
     # A notebook's stderr says that it is no terminal.
     return (sys.stderr.isatty() or _in_notebook()) and _bars() is not None
 

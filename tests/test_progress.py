@@ -89,12 +89,12 @@ def test_a_search_shows_one_bar_and_none_of_its_solves(monkeypatch):
 def test_the_clock_goes_on_while_one_call_says_nothing_and_stops_with_it(monkeypatch):
     seen = watch(monkeypatch)
     monkeypatch.setattr(progress, "TICK", 0.01)
-    before = threading.active_count()
     with pytest.raises(KeyboardInterrupt), progress.bar("deep in Fortran"):
         time.sleep(0.2)
         assert seen().count("deep in Fortran") > 3
+        assert "clock of deep in Fortran" in [thread.name for thread in threading.enumerate()]
         raise KeyboardInterrupt
-    assert threading.active_count() == before
+    assert not any(thread.name.startswith("clock of") for thread in threading.enumerate())
     with progress.bar("next"):
         pass
     assert told(seen)[-1] == "next", "an exception leaves no bar behind to be a stage of"
@@ -147,6 +147,14 @@ def test_no_bar_in_a_pipe_nor_under_tests_nor_for_what_is_quick(monkeypatch):
     monkeypatch.setattr(progress, "DELAY", 60.0)
     js.solve(BRATU, LINE)
     assert sys.stderr.getvalue() == ""
+
+
+def test_solves_in_threads_of_their_own_show_no_bars(monkeypatch):
+    seen = watch(monkeypatch)
+    thread = threading.Thread(target=js.stencils, args=(LINE,), kwargs={"size": 5})
+    thread.start()
+    thread.join()
+    assert seen() == ""
 
 
 def test_a_compiled_solve_is_not_cut_up(monkeypatch):
