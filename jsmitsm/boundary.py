@@ -120,6 +120,8 @@ def group_conditions(problem: Problem, cloud: Cloud, order: int, orders: tuple[i
             groups.append(_laid_out(problem, cloud, name, cloud.groups[name], rest, order, highest))
             counts[name] = len(groups[-1].held) + groups[-1].n_rows
     _refuse_too_many(counts, sum(orders), problem.fields)
+    if problem.fields == 1 and not any(c.kind == "fix" for cs in given.values() for c in cs):
+        _refuse_too_few(counts, sum(orders))
     groups = [g for g in groups if len(g.ids)]
     _refuse_held_twice(groups, problem.fields, len(cloud))
     return groups
@@ -143,6 +145,22 @@ def _refuse_too_many(counts: dict[str, int], total: int, fields: int) -> None:
                 f"bcs[{name!r}]: {count} conditions, and at least {total // 2} on every other side, but an operator of "
                 f"order {total} takes {total // 2} on each; remove some, or let another side have js.free()"
             )
+
+
+def _refuse_too_few(counts: dict[str, int], total: int) -> None:
+    """Fewer conditions than an operator of even order m takes, m / 2 on every side: many functions meet them.
+
+    Where one side is free or has more than its half, as at a start in time, others may have less.
+    """
+    half = total // 2
+    if not counts or total % 2 or min(counts.values()) == 0 or max(counts.values()) > half:
+        return
+    name = min(counts, key=lambda n: counts[n])
+    if counts[name] < half:
+        raise ValueError(
+            f"bcs[{name!r}]: {counts[name]} condition(s), but an operator of order {total} takes {half} on every side; "
+            "give a list of them, as [js.dirichlet(0.0), js.neumann(0.0)], or let another side have js.free()"
+        )
 
 
 def _refuse_held_twice(groups: list[Group], fields: int, n: int) -> None:
@@ -274,6 +292,8 @@ def in_words(error: Exception) -> str:
 
 
 def _shaped(result: Any, components: int, where: str) -> Any:
+    if jnp.iscomplexobj(result):
+        raise ValueError(f"{where}: expected real numbers, got complex ones; take jnp.real of them or two fields")
     result = jnp.asarray(result, float)
     if result.size == components and result.ndim <= 1:
         return result.reshape((components,) if components > 1 else ())

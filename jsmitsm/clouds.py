@@ -11,6 +11,8 @@ import numpy as np
 from jsmitsm.errors import some
 
 INTERIOR = "interior"
+# Coordinates beyond this, or all below its inverse, have powers that are no numbers.
+FAR = 1e100
 _SIDES = (("left", 0, 0), ("right", 0, 1), ("bottom", 1, 0), ("top", 1, 1), ("front", 2, 0), ("back", 2, 1))
 
 
@@ -160,6 +162,12 @@ def _checked_points(points: Any) -> Any:
         bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
         if len(bad):
             raise ValueError(f"points: NaN or infinite coordinates at particles {some(bad, most=8)}; remove them")
+        size = float(abs(points).max())
+        if size > FAR or 0.0 < size < 1.0 / FAR:
+            raise ValueError(
+                f"points: coordinates of size {size:.0e}, whose powers leave the range of floats; use another unit of "
+                "length"
+            )
         order = np.lexsort(points.T)
         same = np.flatnonzero((np.diff(points[order], axis=0) == 0).all(axis=1))
         if len(same):

@@ -15,6 +15,9 @@ from jsmitsm.recursion import Recursion, Slot, source_rows
 from jsmitsm.series import Ring, mul
 from jsmitsm.taylor import factorial, index_of, multi_indices
 
+# Coefficients and sources up to this have squares that are numbers.
+LARGEST = 1e150
+
 
 @dataclass
 class Numbers:
@@ -77,10 +80,15 @@ def operator_numbers(disc: Discretization, problem: Problem, points: Any, taylor
 
 
 def _refuse_nonfinite(points: Any, *series: Any) -> None:
-    """Name the point where the operator or the source is not a number."""
+    """Name the point where the operator or the source is not a number, or its squares are none."""
     for values in series:
-        if is_traced(values, points) or np.isfinite(values).all():
+        if is_traced(values, points) or float(np.max(np.abs(values), initial=0.0)) < LARGEST:
             continue
+        if np.isfinite(values).all():
+            raise ValueError(
+                f"pde: numbers up to {np.abs(values).max():.0e}, whose squares leave the range of floats; divide the "
+                "equation by a number of their size, or use other units"
+            )
         bad = np.flatnonzero(~np.isfinite(np.asarray(values)).all(axis=tuple(range(np.ndim(values) - 1))))
         raise ValueError(
             f"pde: NaN or infinity at {len(bad)} particle(s), first at x = {np.asarray(points)[bad[0]]}, in the "

@@ -169,6 +169,8 @@ class Solution:
         points, weights, normals = quadrature(self.cloud, group)
         if callable(conductivity):
             conductivity = jax.vmap(conductivity)(points)
+        elif not is_traced(conductivity) and np.asarray(conductivity).dtype.kind not in "iuf":
+            raise ValueError(f"conductivity: expected a number or a function of one point x, got {conductivity!r}")
         slope = jnp.einsum("q...d,qd->q...", self.grad(points), normals)
         return jnp.tensordot(weights * conductivity, slope, axes=1)
 

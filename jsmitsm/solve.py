@@ -173,6 +173,8 @@ def _check_start(u0: Any, shape: tuple[int, int]) -> None:
     if u0 is None or callable(u0) or is_traced(u0):
         return
     try:
+        if np.iscomplexobj(u0):
+            raise TypeError
         values = np.asarray(u0, float)
     except (TypeError, ValueError):
         raise ValueError(f"u0: expected a function of x or an array, got {u0!r}") from None

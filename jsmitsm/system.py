@@ -74,7 +74,13 @@ class Run:
         if self.repair:
             self._tell_repairs()
         bad = self.health.undetermined
-        if len(bad):
+        if len(bad) and not np.isfinite(np.asarray(nums.jac)).all():
+            self.fail(
+                f"the equation or its derivative by u is not finite at {len(bad)} particle(s), first {some(bad)}: "
+                "start nearer to the solution (u0), inside the range for which the pde is defined",
+                bad,
+            )
+        elif len(bad):
             self.fail(
                 f"the moment systems of {len(bad)} particle(s) do not determine the solution, first {some(bad)}: too "
                 "few neighbours, or neighbours in a special position; widen the support (h, d or stencils), lower "

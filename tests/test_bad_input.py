@@ -62,6 +62,8 @@ CLOUDS = [
     ("points-no-dims", cloud(np.zeros((3, 0))), "points", "D = 1, 2 or 3"),
     ("points-none-at-all", cloud(np.zeros((0, 2)), {"interior": []}), "points", r"shape \(N, D\)"),
     ("points-nan", cloud([[0.0], [NAN], [1.0]]), "points", "remove"),
+    ("points-huge", cloud([[0.0], [0.5e300], [1e300]]), "points", "unit of length"),
+    ("points-tiny", cloud([[0.0], [0.5e-300], [1e-300]]), "points", "unit of length"),
     ("points-inf", cloud([[0.0], [INF], [1.0]]), "points", "remove"),
     ("points-complex", cloud(DATA + 1j), "points", "real array"),
     ("points-text", cloud([["a"], ["b"], ["c"]]), "points", "real array"),
@@ -233,6 +235,12 @@ ON_A_CLOUD = [
         pde=lambda u, x: js.laplacian(js.laplacian(u))(x),
         bcs=dict.fromkeys(ENDS, [js.dirichlet(0.0), js.neumann(0.0), js.condition(lambda u, x, n: js.laplacian(u)(x))])),
      r"bcs\['left'\]: 3 conditions", "order 4 takes 2"),
+    ("too-few-for-a-beam", solve(pde=lambda u, x: js.laplacian(js.laplacian(u))(x) - 1.0), r"bcs\['left'\].*1 cond",
+     "2 on every side.*neumann"),
+    ("too-few-for-a-plate", solve(pde=lambda u, x: js.laplacian(js.laplacian(u))(x) - 1.0, cloud=SQUARE, bcs={
+        **dict.fromkeys(("right", "bottom", "top"), [js.dirichlet(0.0), js.neumann(0.0)]), "left": js.dirichlet(0.0)}),
+     r"bcs\['left'\].*1 cond", "2 on every side.*neumann"),
+    ("function-complex", ends(left=js.dirichlet(lambda x: 1j * x[0])), r"bcs\['left'\].value", "real numbers"),
     ("array-length", ends(left=js.dirichlet(np.zeros(2))), r"bcs\['left'\].value", r"scalar or \(1,\)"),
     ("array-2d", ends(left=js.dirichlet(np.zeros((1, 1)))), r"bcs\['left'\].value", r"scalar or \(1,\)"),
     ("array-neumann", ends(left=js.neumann(np.zeros(2))), r"bcs\['left'\].value", r"scalar or \(1,\)"),
@@ -302,6 +310,7 @@ SOLVE = [
     ("solver-None", solve(solver=None), "solver:", "'sparse'"),
     ("u0-shape", solve(u0=np.zeros(8)), "u0:", r"\(9,\)"),
     ("u0-nan", solve(u0=np.full(9, NAN)), "u0:", "finite"),
+    ("u0-complex", solve(u0=1j * np.ones(9)), "u0:", "array|function"),
     ("u0-text", solve(u0="zero"), "u0:", "array|function"),
     ("throw-text", solve(throw="no"), "throw:", "True or False"),
     ("method-I-for-a-system", solve(
@@ -349,12 +358,19 @@ RESIDUALS = [
     ("fields-unused", residual(lambda u, x: jnp.stack([js.laplacian(u[0])(x), u[0](x)]), fields=2), "pde.*field 1",
      "use it|lower"),
     ("too-few-equations", residual(lambda u, x: js.laplacian(u[0])(x) + u[1](x), fields=2), "pde", "2|F residuals"),
+    ("field-beyond-in-a-system", residual(lambda u, x: jnp.stack([u[0](x), u[2](x)]), fields=2), "pde.*index 2", "bounds"),
+    ("huge-operator", residual(lambda u, x: 1e300 * js.laplacian(u)(x) - 1.0), "pde.*1e.300", "divide the equation"),
+    ("python-float", residual(lambda u, x: js.laplacian(u)(x) - float(x[0])), "pde", "float"),
+    ("callback", residual(lambda u, x: js.laplacian(u)(x) - jax.pure_callback(
+        np.sin, jax.ShapeDtypeStruct((), x.dtype), x[0])), "pde|primitive", "no Taylor expansion"),
     ("nan-source", residual(lambda u, x: js.laplacian(u)(x) - jnp.log(x[0] - 0.3)), "pde", "finite|NaN"),
     ("singular-source", residual(lambda u, x: js.laplacian(u)(x) - 1.0 / (x[0] - 0.5)), "pde", "finite|NaN"),
     ("nan-coefficient", residual(lambda u, x: jnp.sqrt(x[0] - 0.3) * js.laplacian(u)(x)), "pde", "finite|NaN"),
     ("zero-coefficient", residual(lambda u, x: 0.0 * js.laplacian(u)(x) + x[0]), "pde", r"u\(x\)"),
 ]
 
+FLOW = js.Solution(np.zeros((25, 1)), SQUARE, js.solution.Recipe("S", 2, None, "auto", 1), None, True, 1, {},
+                   fitted=np.zeros((25, 1, 6)))  # fmt: skip
 EVALUATION = [
     ("flat", evaluate(lambda s: s(np.zeros(3))), "points:", r"\(M, 1\)"),
     ("scalar", evaluate(lambda s: s(0.5)), "points:", r"\(M, 1\)"),
@@ -363,6 +379,7 @@ EVALUATION = [
     ("inf", evaluate(lambda s: s.grad(np.array([[INF]]))), "points:", "finite"),
     ("text", evaluate(lambda s: s([["a"]])), "points:", r"\(M, 1\)|number"),
     ("complex", evaluate(lambda s: s(np.array([[1j]]))), "points:", "real"),
+    ("conductivity-text", lambda: FLOW.flux("left", "steel"), "conductivity:", "number or a function"),
     ("derivative-length", evaluate(lambda s: s.derivative([[0.5]], (1, 0))), "multi_index", "1 non-negative"),
     ("derivative-high", evaluate(lambda s: s.derivative([[0.5]], (3,))), "multi_index", "at most 2|sum"),
     ("derivative-negative", evaluate(lambda s: s.derivative([[0.5]], (-1,))), "multi_index", "non-negative"),
@@ -420,6 +437,7 @@ SINGULAR = [
     ("incompatible-neumann", solve(bcs=FLAT), "incompatible|singular"),
     ("floating-part", solve(pde=lambda u, x: js.laplacian(u)(x) - 1.0, bcs={"left": js.free(), "right": js.free()}),
      "singular|condition"),
+    ("outside-the-range", solve(pde=lambda u, x: js.laplacian(u)(x) - jnp.log(u(x))), "not finite at 7.*u0"),
     ("kernel-of-nan", solve(kernel=js.Kernel(lambda r: jnp.log(r - 10.0), 0.125, 3.0)),
      "moment systems|finite|profile"),
 ]  # fmt: skip
@@ -463,3 +481,38 @@ def test_a_cloud_keeps_its_own_copy():
     made = js.Cloud(points, LINE.groups)
     points[:] = NAN
     assert np.isfinite(made.points).all()
+
+
+# ------------------------------------------------------------------ residuals with no derivative, and other precisions
+
+PARABOLA = lambda x: x * (x - 1.0) / 2.0 + x  # noqa: E731
+STEPS = [
+    ("round-of-x", lambda u, x: js.laplacian(u)(x) - 1.0 - 0.0 * x[0] - jnp.round(0.2 * x[0])),
+    ("floor-of-x", lambda u, x: js.laplacian(u)(x) - 1.0 - jnp.floor(0.9 * x[0])),
+    ("integer-of-x", lambda u, x: js.laplacian(u)(x) - 1.0 - (0.9 * x[0]).astype(int)),
+    ("argmax", lambda u, x: js.laplacian(u)(x) - 1.0 - jnp.argmax(x)),
+    ("round-of-u", lambda u, x: js.laplacian(u)(x) - 1.0 - jnp.round(0.2 * u(x))),
+    ("integer-of-u", lambda u, x: js.laplacian(u)(x) - 1.0 - (0.9 * u(x)).astype(int)),
+    ("sign-of-u", lambda u, x: js.laplacian(u)(x) - jnp.sign(u(x) + 1.0)),
+    ("numpy-source", lambda u, x: js.laplacian(u)(x) - np.float32(1.0)),
+]
+
+
+@pytest.mark.parametrize("pde", [pytest.param(e[1], id=e[0]) for e in STEPS])
+def test_a_residual_without_a_derivative_gives_the_right_answer(pde):
+    """Each step is constant on the domain, so that u'' = 1, u(0) = 0, u(1) = 1."""
+    sol = solve(pde=pde)()
+    assert sol.converged and np.abs(sol.u - PARABOLA(LINE.points[:, 0])).max() < 1e-12
+
+
+def test_only_a_step_of_u_does_not_depend_on_u():
+    """Its derivative vanishes wherever there is one: nothing determines u."""
+    with pytest.raises((ValueError, js.SolveError), match="(?s)not finite|depend|singular|determine"):
+        solve(pde=lambda u, x: jnp.round(u(x)) - 1.0)()
+
+
+@pytest.mark.parametrize("method", ["S", "III"])
+def test_without_x64_the_answer_is_right_to_single_precision(method):
+    with jax.enable_x64(False):
+        sol = js.solve(js.Problem(poisson, ENDS), LINE, method=method, kernel=None if method == "S" else KERNEL)
+        assert sol.converged and np.abs(np.asarray(sol.u) - PARABOLA(LINE.points[:, 0])).max() < 1e-4

@@ -61,6 +61,14 @@ def _mixed_derivative(u, x):
     return js.partial(u, (1, 1))(x) + u(x)
 
 
+def _transported(u, x):
+    return jnp.array([1.0, 0.4 + 0.2 * x[0]]) @ js.grad(u)(x) + u(x)
+
+
+def _dispersive(u, x):
+    return js.partial(u, (0, 1))(x) + js.partial(u, (3, 0))(x)
+
+
 def _biharmonic(u, x):
     return js.laplacian(js.laplacian(u))(x)
 
@@ -92,6 +100,14 @@ SCATTERED = (
     scattered(
         "u_xy", "u_xy + u = f, data on two sides", _mixed_derivative, smooth, {4: 1e-5, 6: 1e-8},
         bcs={"right": js.free(), "top": js.free()}, estimates=(4,),
+    ),
+    scattered(
+        "transport", "b(x) . grad u + u = f, data where it flows in", _transported, smooth, {4: 5e-7, 6: 1e-9},
+        bcs={"right": js.free(), "top": js.free()},
+    ),
+    scattered(
+        "dispersion", "u_t + u_xxx = f in space-time", _dispersive, smooth, {6: 1e-5, 8: 1e-7},
+        bcs={"right": [js.dirichlet(smooth), slope(smooth)], "top": js.free()},
     ),
     scattered(
         "biharmonic", "laplacian^2(u) = f, clamped", _biharmonic, smooth, {4: 1e-5, 6: 1e-8, 8: 1e-11},
@@ -170,6 +186,11 @@ ON_LATTICES = (
         (0.0,), (2.0,), 21, source=lambda x: -16 * jnp.sin(4 * x[0]), ceilings={6: 1e-5},
     ),
     layer(0.05, ceilings={4: 6e-3}),
+    on_box(
+        "third order", "u''' + (1 + x) u' = f",
+        lambda u, x: js.partial(u, (3,))(x) + (1 + x[0]) * js.partial(u, (1,))(x), curved, *_UNIT[1], 41, 0.3,
+        bcs={"left": [js.dirichlet(curved), slope(curved)]}, ceilings={6: 1e-5, 8: 1e-7},
+    ),
 )  # fmt: skip
 
 
