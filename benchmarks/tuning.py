@@ -25,7 +25,7 @@ import numpy as np
 
 import jsmitsm as js
 from benchmarks.machine import describe
-from benchmarks.problems import CASES, Case
+from benchmarks.problems import CASES, Case, laplace
 from jsmitsm.objective import nearest_distance, reference
 
 DATA = Path(__file__).parent / "data" / "tuning.json"
@@ -66,7 +66,7 @@ def _setups() -> dict[str, Setup]:
         _setup("oscillatory", "oscillatory", (2, 2, 4), skew),
         _setup("jittered", "jittered", (2, 2, 4), lambda x: jnp.cos(3 * x[0]) * jnp.exp(x[1]), spacing=1 / 13),
         _setup("narrow peak", "narrow peak", (2, 2, 4), wider),
-        _setup("3D", "solid", (2, 2, 2), lambda x: jnp.cos(2 * x[0] + x[1]) * jnp.exp(-x[2]), spacing=1 / 6),
+        _setup("3D", "solid", (2, 2, 4), lambda x: jnp.cos(2 * x[0] + x[1]) * jnp.exp(-x[2]), spacing=1 / 6),
     ]
     return {s.name: s for s in found}
 
@@ -141,7 +141,7 @@ def tuned(b: Bench, start: float, **options: Any) -> dict[str, Any]:
 
 def reference_error(case: Case, cloud: js.Cloud, order: int) -> float:
     """True error in percent of the solution that "estimate" measures against."""
-    values = reference(case.problem(), cloud, {"order": order})[:, 0]
+    values = reference(case.problem(), cloud, {"order": order})[0][:, 0]
     exact = case.values(cloud.points)
     return float(100 * np.linalg.norm(values - exact) / np.linalg.norm(exact))
 
@@ -156,6 +156,7 @@ def record(setup: Setup, method: str, quick: bool) -> dict[str, Any]:
     return {
         "setup": setup.name, "smooth": setup.smooth, "method": method, "order": b.order, "particles": len(b.cloud),
         "spacing": b.spacing, "lebesgue_bound": bound, "paper": paper, "untuned": b.error(0.8, 4.0)[0],
+        "grid_best": min(admitted, default=np.nan),
         "grid_10th_percentile": float(np.quantile(admitted, 0.1)) if admitted else np.nan,
         "grid_solves": len(points), "grid": points, "reference": reference_error(setup.case, b.cloud, b.order),
         "runs": {str(h): tuned(b, h, steps=15 if quick else 50) for h in STARTS},
@@ -174,7 +175,9 @@ def misses(entry: dict[str, Any], run: dict[str, Any]) -> list[str]:
         "1%": run["one_percent"] < 0.2,
         "other": "other" not in run or not np.isfinite(run["other_paper"]) or run["other"] < run["other_paper"],
     }
-    return [name for name, kept in judged.items() if not kept]
+    # Marked where no kernel of the grid keeps it either.
+    mark = {"paper": "*" if entry["grid_best"] > 0.8 * paper else ""}
+    return [name + mark.get(name, "") for name, kept in judged.items() if not kept]
 
 
 HEAD = f"{'problem':<14}{'method':<8}{'from':>5}{'start':>10}{'tuned':>10}{'grid':>10}{'h=0.8':>10}{'paper':>10}"
@@ -214,7 +217,7 @@ class Graded:
 
     def case(self, shift: float = 0.0) -> Case:
         """A logarithm with its pole a little outside of the corner."""
-        near = 6 * self.fine
+        near = 3 * self.fine
 
         def exact(x):
             square = (x[0] + near + shift) ** 2 + (x[1] + near + 0.5 * shift) ** 2
@@ -229,8 +232,8 @@ def record_graded(g: Graded, method: str, quick: bool) -> dict[str, Any]:
     cloud, order = g.cloud(), (2, 2, 4)[METHODS.index(method)]
     own = nearest_distance(cloud.points)  # every particle's spacing
     everyone = js.stencils(cloud, size=len(cloud))
-    problems = [js.Problem(c.pde, {"boundary": js.dirichlet(c.exact)}) for c in (g.case(), g.case(3 * g.fine))]
-    exact = [np.asarray(c.values(cloud.points)) for c in (g.case(), g.case(3 * g.fine))]
+    cases = [g.case(), g.case(3 * g.fine)]
+    problems = [case.problem() for case in cases]
     options = {"method": method, "order": order}
 
     def error(h: Any, d: float, which: int = 0, near: js.Stencils | None = None) -> tuple[float, float]:
@@ -238,14 +241,12 @@ def record_graded(g: Graded, method: str, quick: bool) -> dict[str, Any]:
             sol = js.solve(problems[which], cloud, kernel=js.SuperGaussian(h, d), stencils=near, **options)
         except (js.SolveError, ValueError):
             return np.nan, np.nan
-        off = np.linalg.norm(sol.u - exact[which]) / np.linalg.norm(exact[which])
-        return 100 * float(off), float(sol.stats["lebesgue_max"])
+        return 100 * cases[which].error(sol), float(sol.stats["lebesgue_max"])
 
     widest = own.max()
     ratios, radii = np.geomspace(0.4, 1.6, 4 if quick else 9), np.geomspace(1.6, 4.0, 3 if quick else 6)
     points = [(r, d, *error(r * widest, d, near=everyone)) for r in ratios for d in radii if 1.4 < r * d < 4.5]
-    admitted = [p for p in points if np.isfinite(p[2]) and p[3] <= BOUND]
-    best = min(admitted, key=lambda p: p[2])
+    best = min((p for p in points if np.isfinite(p[2])), key=lambda p: p[2])
     runs = {}
     for start in STARTS:
         begin = time.perf_counter()
@@ -264,7 +265,7 @@ def record_graded(g: Graded, method: str, quick: bool) -> dict[str, Any]:
         "scalar": best[2], "scalar_h": best[0] * widest, "scalar_d": best[1],
         "scalar_other": error(best[0] * widest, best[1], 1, everyone)[0],
         "graded": error(own, 4.0)[0], "graded_other": error(own, 4.0, 1)[0],
-        "reference": 100 * float(np.linalg.norm(reference(problems[0], cloud, options)[:, 0] - exact[0]) / np.linalg.norm(exact[0])),
+        "reference": reference_error(cases[0], cloud, order),
         "runs": runs,
     }  # fmt: skip
 
@@ -294,7 +295,9 @@ def graded_lines(entry: dict[str, Any]) -> list[str]:
 # ------------------------------------------------------------------ all of it
 
 ABOUT = """Relative L2 errors in percent. start: h = 0.7 or 2 spacings, d = 4; grid: 10th percentile of a grid that knows the
-solution; paper: h = 1 spacing, d = 4; reference: what "estimate" measures from; misses: the bounds not kept.
+solution; paper: h = 1 spacing, d = 4; reference: what "estimate" measures from; misses: the bounds not kept,
+namely tuned at most 1.2 grid, 0.8 paper, start; less than 20 % change by 1 % of h or d; better than paper on another solution of
+the same cloud; with the jump of 4.2 at most 1.05 of paper or reference. * : no kernel of the whole grid keeps it.
 """
 ABOUT_GRADED = """
 One h per particle. start: 0.7 or 2 times every particle's own spacing; scalar: the best single h (and d) of a grid that knows

@@ -42,6 +42,7 @@ class Descent:
         self.optimizer = _adam(steps) if optimizer is None else optimizer
         self.points: list[Point] = []
         self.messages: list[str] = []
+        self.step = 0
         self.retreats: list[tuple[int, str]] = []
         self.weak = np.zeros(len(objective.cloud), bool)  # the particles that the last failure was about
         given = objective.given
@@ -53,31 +54,53 @@ class Descent:
 
     def run(self, shown: Any) -> None:
         """Take the steps; ``shown`` is a progress bar."""
-        point = self.best = self._start()
-        state, part, last = self.optimizer.init(point.z), 1.0, 0
-        for step in range(1, self.steps + 1):
+        self.best = self._start()
+        self._descend(shown)
+        if self.space.by_support and len(self.retreats) < RETREATS and self._elsewhere(shown):
+            self._descend(shown)
+        self._tell_retreats()
+
+    def _descend(self, shown: Any) -> None:
+        """Down from the best point, until nothing is gained any more or the steps are used up."""
+        point, part, last = self.best, 1.0, self.step
+        state = self.optimizer.init(point.z)
+        while self.step < self.steps and self.step - last < PATIENCE:
             move, state = self._move(point, state)
             z = self._admitted(point.z, move, part)
             if _largest(jax.tree.map(jnp.subtract, z, point.z)) < 1e-5:
-                self.messages.append(f"Step {step}: nothing moves any more.")
-                break
-            tried, reason = self._tried(z)
-            shown.update(1)
+                self.messages.append(f"Step {self.step + 1}: nothing moves any more.")
+                return
+            tried, reason = self._step(z, shown)
             if tried is None:
-                self.retreats.append((step, reason))
+                self.retreats.append((self.step, reason))
                 self._raise_floor(z)
                 part, point = part / 2.0, self.best
                 state = self.optimizer.init(point.z)
                 if len(self.retreats) == RETREATS:
-                    break
+                    return
                 continue
             point, part = tried, min(1.0, 1.5 * part)
             if self._accept(point):
-                last = step
-            shown.note(f"objective {self.best.score.objective:.3g}")
-            if step - last >= PATIENCE:
-                break
-        self._tell_retreats()
+                last = self.step
+
+    def _step(self, z: Steps, shown: Any) -> tuple[Point | None, str]:
+        self.step += 1
+        found = self._tried(z)
+        shown.update(1)
+        shown.note(f"objective {self.best.score.objective:.3g}")
+        return found
+
+    def _elsewhere(self, shown: Any) -> bool:
+        """Whether another form of the kernel is better: a valley that no descent reaches from here."""
+        gained, z = False, self.best.z
+        for narrower in (1.0, 0.7, 0.5):
+            for smaller in (0.6, 0.4):  # d; h follows from the support
+                if self.step == self.steps:
+                    return gained
+                form = {**z, "d": z["d"] + np.log(narrower), "h": z["h"] + np.log(narrower / smaller)}
+                point, _ = self._step(self.space.kept_within(form, self.lowest, self.highest), shown)
+                gained |= point is not None and self._accept(point)
+        return gained
 
     def _tell_retreats(self) -> None:
         """The steps back, by their reasons."""
