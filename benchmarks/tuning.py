@@ -305,6 +305,52 @@ the solution; graded: h = every particle's own spacing, d = 4; other: another so
 """
 
 
+def _short(x: Any) -> Any:
+    """Numbers to six digits, everywhere inside."""
+    if isinstance(x, dict):
+        return {k: _short(v) for k, v in x.items()}
+    if isinstance(x, list | tuple):
+        return [_short(v) for v in x]
+    return float(f"{x:.6g}") if isinstance(x, float) else x
+
+
+def tables(results: list[dict[str, Any]]) -> dict[str, Any]:
+    """The two tables for the documentation (``python -m benchmarks.readme`` puts them there)."""
+    percent = lambda x: "-" if not np.isfinite(x) else f"{x:.2g}"
+    even, graded = [], []
+    for e in results:
+        for start, run in e["runs"].items():
+            head = [e["setup"], f"{e['method']} {e['order']}", start]
+            if e["setup"] in SETUPS:
+                numbers = (run["start"], run["tuned"], e["grid_10th_percentile"], e["untuned"], e["paper"], e["reference"])
+                missed = ", ".join(misses(e, run))
+                even.append([*head, *map(percent, numbers), run["solves"], e["grid_solves"], missed])
+            else:
+                numbers = (run["start"], run["tuned"], e["scalar"], e["graded"], e["reference"], run["other"], e["scalar_other"])
+                graded.append([*head, *map(percent, numbers), run["solves"], e["grid_solves"]])
+    return {
+        "tuning": {
+            "columns": ["problem", "method", "from h =", "start", "tuned", "grid", "h = 0.8", "paper", "reference", "solves",
+                        "(grid)", "missed"],
+            "rows": even,
+            "note": " ".join(ABOUT.split()).replace("* :", "\\*:"),
+        },
+        "tuning-graded": {
+            "columns": ["cloud", "method", "from h =", "start", "tuned", "scalar", "graded", "reference", "other", "(scalar)",
+                        "solves", "(grid)"],
+            "rows": graded,
+            "note": " ".join(ABOUT_GRADED.split()),
+        },
+    }  # fmt: skip
+
+
+def write(kept: dict[tuple[str, str], Any]) -> None:
+    """All lines in their order, and the tables made of them."""
+    order = [(n, m) for n in (*SETUPS, *GRADED) for m in METHODS]
+    results = [_short(kept[k]) for k in order if k in kept]
+    DATA.write_text(json.dumps({"machine": describe(), "tables": tables(results), "results": results}) + "\n")
+
+
 def main(arguments: list[str]) -> None:
     jax.config.update("jax_enable_x64", True)
     quick, again, only_table = (flag in arguments for flag in ("--quick", "--again", "--table"))
@@ -323,11 +369,11 @@ def main(arguments: list[str]) -> None:
                 kept[key] = make((SETUPS | GRADED)[name], method, quick)
                 jax.clear_caches()  # hundreds of compiled programs otherwise
                 if not quick:
-                    order = [(n, m) for n in (*SETUPS, *GRADED) for m in METHODS]
-                    results = [kept[k] for k in order if k in kept]
-                    DATA.write_text(json.dumps({"machine": describe(), "results": results}) + "\n")
+                    write(kept)
             if key in kept:
                 print("\n".join((lines if name in SETUPS else graded_lines)(kept[key])), flush=True)
+    if only_table:
+        write(kept)
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ import numpy as np
 
 from jsmitsm.errors import SolveError
 from jsmitsm.health import LEBESGUE
-from jsmitsm.kernels import Kernel
+from jsmitsm.kernels import EDGE, Kernel
 from jsmitsm.objective import SHAKE, UNBOUNDED, Objective, Score
 from jsmitsm.parametermaps import ParameterMap, Steps
 
@@ -24,6 +24,7 @@ GAIN = 0.005
 RETREATS = 8
 # Logarithms of parameters stay within this of the start: no optimizer may overflow them.
 FAR = 20.0
+OVERFLOW = "Supports were held inside the given stencils; wider ones need wider stencils, or none given."
 
 
 class Point(NamedTuple):
@@ -125,6 +126,9 @@ class Descent:
         """Where a part of the move leads, within all bounds."""
         move = jax.tree.map(lambda x: part * jnp.clip(jnp.nan_to_num(x), -STRIDE, STRIDE), move)
         new = jax.tree.map(lambda x, y: jnp.clip(x + y, -FAR, FAR), z, move)
+        wide = self.objective.support(_concrete(self.space.kernel(new))) > self.highest * EDGE
+        if wide.any() and OVERFLOW not in self.messages:
+            self.messages.append(OVERFLOW)
         return self.space.kept_within(new, self.lowest, self.highest)
 
     def _tried(self, z: Steps) -> tuple[Point | None, str]:

@@ -162,6 +162,13 @@ def test_an_objective_that_turns_nan_is_backed_off_from(result):
     assert any("nan" in m for m in found.messages)
 
 
+def test_a_support_that_turns_singular_is_backed_off_from():
+    """An objective that rewards ever smaller supports: they end where the polynomials are just determined."""
+    found = tuned(objective=lambda sol: sol._fit.kernel.h * sol._fit.kernel.d, method="III", steps=20)
+    assert np.isfinite([found.kernel.h, found.kernel.d]).all() and found.solution.converged
+    assert 0.99 * s < found.kernel.h * found.kernel.d < 4 * s
+
+
 def test_a_start_that_is_too_narrow_is_widened():
     found = tuned(js.SuperGaussian(0.4 * s, 2.0), steps=3)
     assert found.kernel.h * found.kernel.d > s and "start" in found.messages[0]
@@ -177,6 +184,7 @@ def test_the_support_stays_inside_given_stencils():
     near = js.stencils(cloud, radius=4.2 * s)
     found = tuned(js.SuperGaussian(s, 4.0), objective=lambda sol: -sol._fit.kernel.h * sol._fit.kernel.d, steps=8, stencils=near)
     assert 4.1 * s < found.kernel.h * found.kernel.d <= 4.2 * s * (1 + 1e-6)
+    assert any("held inside the given stencils" in m for m in found.messages)
 
 
 def test_the_pattern_is_rebuilt_only_when_outgrown(monkeypatch):
