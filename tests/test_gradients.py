@@ -260,7 +260,7 @@ TRANSFORMS = {
     "jvp": lambda f, t: jax.jvp(lambda x: f({**t, "robin_a": x}), (t["robin_a"],), (1.0,))[1],
     "jacfwd": lambda f, t: jax.jacfwd(lambda x: f({**t, "wall": x}))(t["wall"]),
     "vmap of grad": lambda f, t: jax.vmap(jax.grad(lambda x: f({**t, "source": x})[2]))(jnp.array([1.0, 2.0])),
-    "grad of grad": lambda f, t: jax.grad(jax.grad(lambda x: f({**t, "diffusion": x})[2]))(0.4),
+    "grad of grad": lambda f, t: jax.grad(jax.grad(lambda x: f({**t, "source": x})[2] ** 2))(2.0),
     "jit of vmap": lambda f, t: jax.jit(jax.vmap(lambda x: f({**t, "source": x})))(jnp.array([1.0, 2.0])),
 }
 
