@@ -78,6 +78,11 @@ def test_the_history_is_ready_to_plot_and_the_best_of_it_is_returned(result):
     assert np.isfinite(np.concatenate(list(history.values()))).all()
 
 
+def test_other_forms_of_the_kernel_are_tried(result):
+    """Where the descent ends, other d at the same support are looked at: Adam alone moves by a tenth in a step."""
+    assert np.abs(np.diff(np.log(result.history["d"]))).max() > 0.4
+
+
 def test_the_result_says_itself_in_one_line(result):
     assert "\n" not in repr(result) and len(repr(result)) < 160 and "SuperGaussian" in repr(result)
 
