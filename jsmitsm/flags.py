@@ -34,6 +34,8 @@ MISFIT = 0.01
 PECLET = 1.0
 # Round-off of the moment systems times the condition: this leaves two digits.
 ROUND_OFF = 1e-2
+# Coordinates rounded by this part of the spacing put the particles somewhere else.
+ROUNDED = 1e-3
 # (k s)^(p+1) cells, with s the spacing: the phase error a wave gathers across the domain. By order, as above.
 PHASE = (0.9, 3.5)
 
@@ -45,7 +47,7 @@ def flags(run: Any, values: Any, nums: Any) -> tuple[list[str], dict[str, float]
         return ["The values are not finite."], {}
     out: list[str] = []
     found: dict[str, float] = {}
-    for test in (_roughness, _condition, _source, _weakness, _misfit, _peclet, _waves):
+    for test in (_roughness, _condition, _source, _weakness, _misfit, _peclet, _waves, _far_away):
         test(run, values, nums, out, found)
     return out, found
 
@@ -195,4 +197,18 @@ def _waves(run: Any, values: np.ndarray, nums: Any, out: list[str], found: dict[
         out.append(
             f"The operator has waves of {2 * np.pi / (k * spacing):.1f} particles a length, too few for order {order} "
             f"over {cells:.0f} particles: their phase is lost; refine, or raise the order."
+        )
+
+
+def _far_away(run: Any, values: np.ndarray, nums: Any, out: list[str], found: dict[str, float]) -> None:
+    """Far from the origin the coordinates themselves lose digits, and with them source and boundary values."""
+    if run.rows is None:
+        return
+    dtype = np.asarray(run.rows[1][0].weights).dtype
+    far = float(np.abs(np.asarray(run.disc.cloud.points)).max())
+    found["rounded"] = float(np.finfo(dtype).eps) * far / (dz.mean_spacing(run.disc) or far or 1.0)
+    if found["rounded"] > ROUNDED:
+        out.append(
+            f"Coordinates up to {far:.0e} in {dtype} are known to {found['rounded']:.1g} of the spacing only: move the "
+            "cloud to the origin, or use float64."
         )

@@ -98,3 +98,13 @@ def test_neighbours_on_a_line_have_a_condition_without_bound():
     usual, bad = (js.solve(posed(laplace, smooth), c, method="SSPH", order=2).condition_numbers() for c in (square(9), thin))
     inside = thin.groups["interior"]
     assert bad[0][inside].max() > 100.0 * usual[0][inside].max()
+
+
+def test_coordinates_that_float32_cannot_hold():
+    """At 1e4 sizes from the origin float32 rounds them to a twentieth of the spacing."""
+    with jax.enable_x64(False):
+        for far, told in ((0.0, False), (1e4, True)):
+            line = js.interval(far, far + 1.0, 41)
+            held = {"left": js.dirichlet(0.0), "right": js.dirichlet(1.0)}
+            sol = js.solve(js.Problem(lambda u, x: js.laplacian(u)(x) - 1.0, held), line)
+            assert told == any("known to" in flag for flag in sol.flags)
