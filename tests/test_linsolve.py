@@ -534,10 +534,14 @@ def test_what_does_not_fit_in_memory_is_refused(monkeypatch):
     problem = js.Problem(lambda u, x: js.laplacian(u)(x), sides)
     js.solve(problem, cloud, solver="sparse")
     linsolve.clear_cache()
-    monkeypatch.setattr(sparse, "_memory", lambda: 1e6)
-    with pytest.raises(js.SolveError, match=r'about 0\.0 GB for 529 unknowns.*solver="iterative"'):
+    monkeypatch.setattr(sparse, "_memory", lambda: 5e7)
+    monkeypatch.setattr(sparse, "estimate_memory", lambda *_: 10**8)  # of the factors; the rows fit
+    with pytest.raises(js.SolveError, match=r'about 0\.1 GB for 529 unknowns.*solver="iterative"'):
         js.solve(problem, cloud, solver="sparse")
     assert js.solve(problem, cloud, solver="iterative").converged
+    monkeypatch.setattr(sparse, "_memory", lambda: 1e5)
+    with pytest.raises(js.SolveError, match="the rows and the matrix would need about .* fewer particles"):
+        js.solve(problem, cloud, solver="iterative")
 
 
 def test_memory_estimate():
