@@ -9,6 +9,7 @@ import jax
 import numpy as np
 
 from jsmitsm.clouds import Cloud
+from jsmitsm.interrupts import interruptible
 from jsmitsm.kernels import EDGE
 from jsmitsm.progress import bar
 from jsmitsm.threads import cores
@@ -174,12 +175,15 @@ def _tree(points: np.ndarray) -> Any:
 def _query(tree: Any, centres: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Distances and numbers of the ``count`` nearest particles of every centre, (n, count)."""
     n = len(centres)
-    workers = cores() if n >= _MANY else 1
-    if n < _MANY or n != tree.n:
-        return tree.query(centres, k=count, workers=workers)
+    if n < _MANY:
+        return tree.query(centres, k=count)
+    # Beside the main thread: an interrupt must not take away the arrays that the workers of the search write into.
+    search = lambda places: interruptible(lambda: tree.query(places, k=count, workers=cores()))
+    if n != tree.n:
+        return search(centres)
     # In the order of the tree's leaves: the search finds in the cache what it found for the centre before.
     order = tree.indices
-    found = tree.query(centres[order], k=count, workers=workers)
+    found = search(centres[order])
     distance, index = np.empty_like(found[0]), np.empty_like(found[1])
     distance[order], index[order] = found
     return distance, index
