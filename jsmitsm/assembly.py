@@ -30,8 +30,9 @@ _FEW, _VERY_FEW = 128, 16
 # costs in running is about a millisecond a call.
 _ALONE: Any = {"xla_cpu_multi_thread_eigen": False}
 _PLAIN: Any = _ALONE | {"xla_cpu_use_fusion_emitters": False, "xla_cpu_parallel_codegen_split_count": 1}
+QUICKLY: Any = _PLAIN | {"xla_backend_optimization_level": 0}
 _EFFORT = (
-    (_FEW, _PLAIN | {"xla_backend_optimization_level": 0}),
+    (_FEW, QUICKLY),
     (2048, _PLAIN | {"xla_backend_optimization_level": 1}),
     (np.inf, _ALONE),
 )

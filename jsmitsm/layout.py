@@ -19,7 +19,6 @@ from jsmitsm.problem import Problem
 from jsmitsm.recursion import Recursion, free_indices, recursion
 from jsmitsm.trace import Traced, trace
 
-METHODS = ("I", "II", "III", "S", "SSPH")
 # Neighbours for every free coefficient, by the order of the expansions, where the particles are evenly spaced.
 _EVEN_RATIO = {4: 1.5, 5: 1.5, 6: 1.5, 7: 1.65, 8: 1.65}
 

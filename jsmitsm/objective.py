@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm import discretize as dz
+from jsmitsm.assembly import QUICKLY
 from jsmitsm.clouds import Cloud
 from jsmitsm.errors import SolveError
 from jsmitsm.health import DEFECT, LEBESGUE
@@ -42,8 +43,6 @@ HIGHEST = 14
 # Up to so many particles score and gradient are one compiled program. Beyond, what the program
 # would hold as constants takes long to compile, and a step is long anyway.
 COMPILED = 3000
-# A few dozen calls do not repay an optimising compiler, which takes five times as long.
-QUICKLY: Any = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 0}
 
 
 class Score(NamedTuple):
@@ -155,6 +154,7 @@ class Objective:
         if key not in self._compiled:
             graded = jax.value_and_grad(lambda z: self.score(kernel_of(z)), has_aux=True)
             if self.linear and len(self.cloud) <= COMPILED:
+                # A few dozen calls do not repay an optimising compiler, which takes five times as long.
                 graded = jax.jit(graded, compiler_options=QUICKLY if jax.default_backend() == "cpu" else None)
             self._compiled = {key: graded}
         (score, (value, lebesgue, defect, values, taylor)), slope = self._compiled[key](z)
