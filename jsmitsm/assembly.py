@@ -19,12 +19,13 @@ from jsmitsm.boundary import is_traced
 from jsmitsm.closure import Recovery
 from jsmitsm.kernels import Kernel
 from jsmitsm.moments import Block, Elimination, Row, Scheme, Support
-from jsmitsm.recursion import row_levels
+from jsmitsm.recursion import row_lifts
 
-# Particles per block: larger blocks leave the cache and are several times slower.
-_BLOCK = 64
+# Particles per block: larger blocks leave the cache and are several times slower; in one of a power of two, rows of
+# the small matrices fall on the same lines of the cache.
+_BLOCK = 48
 # So few particles are always padded to as many.
-_FEW, _VERY_FEW = 128, 16
+_FEW, _VERY_FEW = 3 * _BLOCK, 16
 # Options of XLA on CPUs. Its matrix products here are too small to share among threads; threads.py does that with whole
 # pieces. Up to so many particles a program is compiled with less effort, in a half or a sixth of the time; what that
 # costs in running is about a millisecond a call.
@@ -63,8 +64,9 @@ def padded_size(n: int) -> int:
     compiled program serves the next cloud too; at most one part in eight is wasted."""
     if n <= _FEW:
         return _FEW if n > _VERY_FEW else _VERY_FEW
-    step = max(_BLOCK, 1 << ((n - 1).bit_length() - 4))
-    return -(-n // step) * step
+    blocks = -(-n // _BLOCK)
+    step = 1 << max(0, (blocks - 1).bit_length() - 4)
+    return -(-blocks // step) * step * _BLOCK
 
 
 def _pad(x: Any, n: int, size: int) -> Any:
@@ -192,7 +194,7 @@ def _prepared(scheme, points, kernel, i, near_ids, operands: Operands, jac, own)
         near = moments.at_length(near, operands.lengths[jac])
         solution = jax.tree.map(lambda x: x[jac], operands.shared)
     else:
-        lift = operands.shared.lift * near.length ** jnp.asarray(row_levels(scheme.rec))
+        lift = operands.shared.lift * row_lifts(scheme.rec, near.length)
         solution = operands.shared._replace(lift=lift)
     data = None
     if scheme.n_data:

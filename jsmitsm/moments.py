@@ -261,11 +261,12 @@ def functional(scheme: Scheme, near: Support, system: System, wanted: Any) -> tu
     """
     target = system.reduced.T @ wanted.T
     w = _fit(scheme, system.weight, system.phi, system.tests, target)
+    rest = wanted.T - system.values.T @ w
     size = jnp.max(jnp.abs(target), initial=0.0)
-    defect = jnp.max(jnp.abs(system.phi.T @ w - target), initial=0.0) / jnp.where(size > 0, size, 1.0)
+    # What phi^T w lacks of the target.
+    defect = jnp.max(jnp.abs(system.reduced.T @ rest), initial=0.0) / jnp.where(size > 0, size, 1.0)
     if not (scheme.sourced or scheme.n_own):
         return w, jnp.zeros((scheme.rec.n_rows, wanted.shape[0])), jnp.zeros((0, wanted.shape[0])), defect
-    rest = wanted.T - system.values.T @ w
     v_own = system.own_solve.T @ (system.elimination.basis.T @ rest)
     v = system.elimination.particular.T @ (rest - system.own_rows.T @ v_own)
     return w, v, v_own, defect

@@ -132,9 +132,13 @@ def _entries(rec: Recursion) -> dict[str, np.ndarray]:
     return {name: np.array(values) for name, values in zip(names, zip(*found))}
 
 
-def row_levels(rec: Recursion) -> np.ndarray:
-    """The power of length that makes each constraint free of units."""
-    return np.array([float(rec.levels[e] + sum(c)) for e, c in _rows(rec)])
+def row_lifts(rec: Recursion, length: Any, xp: Any = jnp) -> Any:
+    """The powers of length that make each constraint free of units: (rows,).
+
+    Integer powers are products: many times cheaper than a general power.
+    """
+    levels, place = np.unique([rec.levels[e] + sum(c) for e, c in _rows(rec)], return_inverse=True)
+    return xp.stack([length ** int(k) for k in levels])[place]
 
 
 def constraints(rec: Recursion, jac: Any, length: Any, xp: Any = jnp) -> tuple[Any, Any]:
@@ -159,7 +163,7 @@ def constraints(rec: Recursion, jac: Any, length: Any, xp: Any = jnp) -> tuple[A
         matrix = jnp.zeros(shape, values.dtype).at[row, col].add(values)
     norm = xp.sqrt(xp.sum(matrix**2, axis=1))
     norm = xp.where(norm > 0, norm, 1.0)
-    return matrix / norm[:, None], length ** xp.asarray(row_levels(rec)) / norm
+    return matrix / norm[:, None], row_lifts(rec, length, xp) / norm
 
 
 def source_rows(rec: Recursion, residual: Any) -> Any:

@@ -6,7 +6,7 @@ do not run on every device; loops of rank-one updates do, and are faster at thes
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -90,17 +90,27 @@ def _general_inverse_jvp(primals, tangents):
     return inverse, -inverse @ (tangents[0] @ inverse)
 
 
-def gram_inverse(a: Any, tolerance: float | None = None) -> Any:
+class GramInverse(NamedTuple):
+    """(A^T A)^-1 = scale matrix scale, from columns of unit length."""
+
+    matrix: Any  # (k, k)
+    scale: Any  # (k,)
+
+    def __matmul__(self, t: Any) -> Any:
+        scale = self.scale if t.ndim == 1 else self.scale[:, None]
+        return scale * (self.matrix @ (scale * t))
+
+
+def gram_inverse(a: Any, tolerance: float | None = None) -> GramInverse:
     """(A^T A)^-1 for a tall A (n, k) by symmetric sweeps; with a tolerance, columns that depend
     on others up to it are left out (zero rows and columns)."""
     if not a.shape[1]:  # conditions may leave nothing free
-        return jnp.zeros((0, 0), a.dtype)
-    size = jnp.sqrt(jnp.sum(a**2, axis=0))
-    scale = 1.0 / jnp.where(size > 0, size, 1.0)
-    a = a * scale
+        return GramInverse(jnp.zeros((0, 0), a.dtype), jnp.zeros(0, a.dtype))
     gram = a.T @ a
-    inverse = _inverse(gram) if tolerance is None else _pivoted_inverse(gram, tolerance)
-    return inverse * scale[:, None] * scale[None, :]
+    square = jnp.diagonal(gram)
+    scale = 1.0 / jnp.sqrt(jnp.where(square > 0, square, 1.0))
+    gram = gram * scale[:, None] * scale
+    return GramInverse(_inverse(gram) if tolerance is None else _pivoted_inverse(gram, tolerance), scale)
 
 
 @jax.custom_jvp
@@ -172,7 +182,8 @@ def min_norm(a: Any, t: Any, tolerance: float | None = None) -> Any:
     return _min_norm(tolerance, a, t)[0]
 
 
-def solve_gram(a: Any, inverse: Any, t: Any) -> Any:
+def solve_gram(a: Any, inverse: GramInverse, t: Any) -> Any:
+    """y (k, m) with A^T A y = t, refined once."""
     y = inverse @ t
     return y + inverse @ (t - a.T @ (a @ y))
 
