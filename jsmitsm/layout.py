@@ -9,7 +9,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from jsmitsm.boundary import Group, group_conditions, in_words, is_traced
+from jsmitsm.boundary import Group, concrete, group_conditions, in_words, is_traced
 from jsmitsm.clouds import Cloud
 from jsmitsm.kernels import EDGE, Constant, Gaussian, Kernel
 from jsmitsm.moments import Scheme
@@ -116,6 +116,8 @@ def discretize(
             f"method: {method} takes one condition where values are held, but a boundary has more (as a clamped "
             'plate has); use "S" or "SSPH"'
         )
+    if method == "SSPH":
+        _check_collocated(groups, problem.fields)
     if kernel is not None and not is_traced(kernel) and np.shape(kernel.h) not in ((), (len(cloud),)):
         raise ValueError(
             f"kernel: h has shape {np.shape(kernel.h)}, expected a scalar or one per particle, ({len(cloud)},)"
@@ -137,6 +139,17 @@ def discretize(
     _check_supports(disc)
     disc.classes = sorted_classes(disc, np.flatnonzero(~held.all(axis=1)), stencils)
     return disc
+
+
+def _check_collocated(groups: list[Group], fields: int) -> None:
+    """A particle of SSPH states its equations or its conditions, as many of either as there are fields."""
+    for group in groups:
+        count = len(group.held) + group.n_rows
+        if count not in (0, fields) and len(group.held) < fields:
+            raise ValueError(
+                f"bcs[{group.name!r}]: {count} condition(s) for {fields} field(s), but method SSPH puts a condition in "
+                f'the place of every equation there and takes {fields}, or none (js.free()); use method="S"'
+            )
 
 
 def sorted_classes(disc: Discretization, ids: np.ndarray, stencils: Stencils) -> list[Class]:
@@ -328,7 +341,8 @@ def find_stencils(
                 "in every stencil; lower the order or add particles"
             )
         if cloud.dim == 1:
-            return in_line(points, min(default_size(scheme), len(points)), which)
+            normals = None if len(images.owner) else concrete(cloud.normals)
+            return in_line(points, min(default_size(scheme), len(points)), which, normals)
         size = min(default_size(scheme, scheme.method == "S" and evenly_spaced(points)), len(points))
         found, full = nearest(points, size, which), min(default_size(scheme), len(points))
         if size == full:

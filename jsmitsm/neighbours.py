@@ -189,20 +189,29 @@ def _query(tree: Any, centres: np.ndarray, count: int) -> tuple[np.ndarray, np.n
     return distance, index
 
 
-def in_line(points: np.ndarray, size: int, which: np.ndarray | None = None) -> Stencils:
+def in_line(
+    points: np.ndarray, size: int, which: np.ndarray | None = None, normals: np.ndarray | None = None
+) -> Stencils:
     """In 1D: as many neighbours on either side, ``size`` in all with the particle itself.
 
-    The nearest ones would leave a cluster of particles without a link to the others.
+    The nearest ones would leave a cluster of particles without a link to the others. Where outward ``normals`` face
+    one another the domain has a gap, over which nobody reaches who has enough neighbours on his own side.
     """
     n = len(points)
     x = points[:, 0]
     order = np.argsort(x, kind="stable")
     rank = np.empty(n, int)
     rank[order] = np.arange(n)
-    own = np.arange(n) if which is None else which
-    first = np.clip(rank[own] - size // 2, 0, n - size)
+    own = rank[np.arange(n) if which is None else which]
+    outward = np.zeros(n) if normals is None else np.nan_to_num(normals[order, 0])
+    cuts = np.flatnonzero((outward[:-1] > 0) & (outward[1:] < 0)) + 1
+    starts = np.concatenate([[0], cuts, [n]])
+    part = np.searchsorted(starts, own, side="right")
+    low, high = starts[part - 1], starts[part]
+    alone = high - low >= size
+    first = np.clip(own - size // 2, np.where(alone, low, 0), np.where(alone, high, n) - size)
     index = order[first[:, None] + np.arange(size)].astype(np.int32)
-    return Stencils(_self_first(index, which), np.abs(x[index] - x[own][:, None]).max(axis=1))
+    return Stencils(_self_first(index, which), np.abs(x[index] - x[order[own]][:, None]).max(axis=1))
 
 
 def within(points: np.ndarray, radius: Any, which: np.ndarray | None = None) -> Stencils:

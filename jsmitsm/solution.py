@@ -204,8 +204,8 @@ class Solution:
         """The condition number (N,) of every particle's moment matrix, and an estimate of the global system's.
 
         The matrices are those with rows and columns scaled to about one, so that units do not count.
-        NaN for particles whose values are held, and for a system solved by iteration. They say how
-        many digits round-off may take; they do not predict the error: the Lebesgue constants do more.
+        NaN for particles whose values are held. They say how many digits round-off may take; they do not
+        predict the error: the Lebesgue constants do more.
 
         Raises ValueError for a solution that was pickled or made under ``jax.jit``.
         """
@@ -222,8 +222,9 @@ class Solution:
         lines = [repr(self)]
         if not bool(self.converged):
             lines.append("The solve did NOT converge; do not trust these values.")
-        lines += [f"FLAG: {line}" for line in self.flags if not line.startswith("FAILED")]
-        lines += [str(line) for line in s.get("messages", [])]
+        told = s.get("messages", [])
+        lines += [f"FLAG: {line}" for line in self.flags if line not in told]
+        lines += [str(line) for line in told]
         if "lebesgue_max" in s:
             lines.append(f"Largest Lebesgue constant {s['lebesgue_max']:.3g} (up to 1.5 is healthy).")
         if "residual" in s:

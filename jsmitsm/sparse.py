@@ -289,13 +289,15 @@ class Factor:
     def _refuse_singular(self) -> None:
         """Raise where one random right-hand side, or else the condition number, betrays it."""
         probe = np.random.default_rng(0).standard_normal((self.n, 1))
-        if self._backends[0] in ITERATIVE:
-            self._lu.apply(probe, False, tolerance=1e-6)
-            if self._lu.stalled:  # only a direct solver can tell why
-                self._give_way("stalled")
+        krylov = self._backends[0] in ITERATIVE
+        x = self._lu.apply(probe, False, tolerance=1e-6) if krylov else self._lu.apply(probe, False)
+        growth = abs(x).max() * self._norms[False] / abs(probe).max()
+        small = growth < 1e-3 * SINGULAR / np.sqrt(self.n)
+        if krylov:
+            if self._lu.stalled or not small:  # only a direct solver can tell why
+                self._give_way("stalled" if self._lu.stalled else "met a nearly singular matrix")
             return
-        growth = abs(self._lu.apply(probe, False)).max() * self._norms[False] / abs(probe).max()
-        if growth < 1e-3 * SINGULAR / np.sqrt(self.n):
+        if small:
             return
         condition = condition_estimate(self) if np.isfinite(growth) else np.inf
         if condition < SINGULAR or (np.isinf(condition) and self._give_way("broke down")):
@@ -424,20 +426,22 @@ def condition_estimate(factor: Factor) -> float:
       >>> condition_estimate(Factor(np.array([1.0, 2.0**-20]), index, index, 2))
       1.0
     """
-    n, backend = factor.n, factor._lu
+    n, apply = factor.n, factor._lu.apply
+    if factor._backends[0] in ITERATIVE:  # two digits of the number are enough
+        apply = partial(apply, tolerance=1e-6)
     if not n:
         return 1.0
     x = np.full((n, 1), 1.0 / n)
     best = 0.0
     for _ in range(5):
-        y = backend.apply(x, False)
+        y = apply(x, False)
         size = float(abs(y).sum())
         if not np.isfinite(size):
             return float("inf")
         if size <= best:
             break
         best = size
-        z = backend.apply(np.where(y < 0, -1.0, 1.0), True)
+        z = apply(np.where(y < 0, -1.0, 1.0), True)
         j = int(abs(z).argmax())
         if abs(z[j, 0]) <= abs(z[:, 0] @ x[:, 0]):
             break
@@ -445,7 +449,7 @@ def condition_estimate(factor: Factor) -> float:
         x[j] = 1.0
     ramp = np.arange(n) / max(n - 1, 1)
     alternating = (np.where(np.arange(n) % 2, -1.0, 1.0) * (1.0 + ramp))[:, None]
-    other = 2.0 * float(abs(backend.apply(alternating, False)).sum()) / (3.0 * n)
+    other = 2.0 * float(abs(apply(alternating, False)).sum()) / (3.0 * n)
     return factor._norms[True] * max(best, other)
 
 
