@@ -7,6 +7,7 @@ of JAX, as the README shows.
 
 from __future__ import annotations
 
+import compileall
 import json
 import os
 import statistics
@@ -54,6 +55,7 @@ def seconds(cache: str | None) -> list[float]:
 
 def main() -> None:
     about, rows, found = machine.describe(), [], {}
+    compileall.compile_dir(Path(__file__).parent.parent / "jsmitsm", quiet=1)  # as pip does when it installs
     with tempfile.TemporaryDirectory() as folder:
         for name, cache in (("without a cache", None), ("with the persistent cache", folder)):
             seconds(cache)  # fills the caches, of the disk too

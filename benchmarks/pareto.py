@@ -77,7 +77,7 @@ def _ball(n: int) -> js.Cloud:
     return CASES["smooth ball"].cloud(n, round(1.6 * n ** (2 / 3) * 3.6))
 
 
-SPACINGS = (0.13, 0.1, 0.08, 0.06, 0.042, 0.028, 0.02, 0.0137, 0.0092, 0.0061)
+SPACINGS = (0.16, 0.13, 0.1, 0.08, 0.06, 0.042, 0.028, 0.02, 0.0137, 0.0092, 0.0061)
 LATTICES = ((9, 19), (17, 37), (25, 55), (33, 73), (49, 109), (65, 145), (129, 289), (257, 577))
 AMOEBA, CONDUCTOR = CASES["amoeba"], CASES["conducting amoeba"]
 # Its source by AD as in the others.

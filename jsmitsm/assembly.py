@@ -25,7 +25,7 @@ from jsmitsm.recursion import row_lifts
 # the small matrices fall on the same lines of the cache.
 _BLOCK = 48
 # So few particles are always padded to as many.
-_FEW, _VERY_FEW = 3 * _BLOCK, 16
+_FEW, _VERY_FEW = 2 * _BLOCK, 16
 # Options of XLA on CPUs. Its matrix products here are too small to share among threads; threads.py does that with whole
 # pieces. Up to so many particles a program is compiled with less effort, in a half or a sixth of the time; what that
 # costs in running is about a millisecond a call.

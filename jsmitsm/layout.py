@@ -160,7 +160,7 @@ def sorted_classes(disc: Discretization, ids: np.ndarray, stencils: Stencils) ->
         used = [near.shape[1]] * 2
     else:
         counts = np.max(np.where(near[ids] >= 0, np.arange(near.shape[1]), 0), axis=1, initial=0) + 1
-        narrow = int(np.quantile(counts, 0.8)) if len(ids) else 1
+        narrow = int(np.sort(counts)[4 * (len(ids) - 1) // 5]) if len(ids) else 1
         wide = counts > 1.25 * narrow
         used = [_rounded(int(counts[~wide].max(initial=1))), _rounded(near.shape[1])]
         near = np.pad(near, ((0, 0), (0, max(0, max(used) - near.shape[1]))), constant_values=-1)

@@ -75,7 +75,7 @@ def solve(
         multiplier, is an unknown without a place and is eliminated last.
       solver: "dense" (LAPACK; pure JAX where anything is traced), "sparse" (LU, by PARDISO where that is
         installed and faster), "mixed" (LU in float32, corrected to float64 by BiCGSTAB), "iterative"
-        (BiCGSTAB with multigrid, where pyamg is installed, or incomplete LU) or "auto": dense up to 190
+        (BiCGSTAB with multigrid, where pyamg is installed, or incomplete LU) or "auto": dense up to 140
         unknowns, then LU, mixed and multigrid for the elliptic systems that are large enough for them
         to be faster. Mixed and iterative fall back to LU where they stall.
       elliptic: False keeps "auto" away from multigrid.

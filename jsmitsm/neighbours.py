@@ -153,7 +153,8 @@ def evenly_spaced(points: np.ndarray) -> bool:
     distance, _ = _query(_tree(points), _sampled(points, 4 * _SAMPLE), count + 1)
     volume = {1: 2.0, 2: np.pi, 3: 4.0 * np.pi / 3.0}[points.shape[1]]
     spacing = distance[:, -1] * (volume / (count + 1)) ** (1.0 / points.shape[1])
-    return bool(np.quantile(distance[:, 1] / np.where(spacing > 0, spacing, 1.0), 0.1) > _EVEN)
+    relative = np.sort(distance[:, 1] / np.where(spacing > 0, spacing, 1.0))
+    return bool(relative[len(relative) // 10] > _EVEN)
 
 
 def jumps(radius: np.ndarray, neighbours: np.ndarray) -> np.ndarray:

@@ -24,9 +24,9 @@ from jsmitsm.ordering import nested_dissection
 from jsmitsm.progress import bar
 from jsmitsm.threads import cores
 
-# Unknowns up to which LAPACK beats the sparse codes. From 200 on it would use several threads, which
-# on a busy machine wait for one another a hundred times longer than they work.
-DENSE_MAX = 190
+# Unknowns up to which LAPACK is asked. It beats the sparse codes a little further, but uses several
+# threads there, which on a busy machine wait for one another a hundred times longer than they work.
+DENSE_MAX = 140
 # Unknowns from which multigrid was faster than LU, refined to round-off and with one adjoint solve.
 ITERATIVE_MIN = {2: 200_000, 3: 6_000}
 # Unknowns from which factors in float32, with refinement, were faster than those in float64.
