@@ -32,7 +32,10 @@ _TAGS = ("gmsh:physical", "medit:ref", "cell_tags", "gambit:ref", "su2:tag", "av
 
 def volume_cells(blocks: Any) -> tuple[int, list[tuple[str, np.ndarray]]]:
     """The dimension of a mesh and its cells of that dimension."""
-    blocks = [(block.type, np.asarray(block.data)) for block in blocks if len(block.data)]
+    try:
+        blocks = [(block.type, np.asarray(block.data)) for block in blocks if len(block.data)]
+    except (AttributeError, TypeError):
+        raise ValueError("mesh: its cells are no meshio cell blocks; make it with meshio.Mesh(points, cells)") from None
     unknown = sorted({kind for kind, _ in blocks} - set(_DIMS))
     if unknown:
         raise ValueError(
@@ -42,6 +45,23 @@ def volume_cells(blocks: Any) -> tuple[int, list[tuple[str, np.ndarray]]]:
     if dim == 0:
         raise ValueError("mesh: has no cells (lines, triangles, tetrahedra, ...); for bare points use js.Cloud")
     return dim, [(kind, block) for kind, block in blocks if _DIMS[kind] == dim]
+
+
+def check_cells(count: int, cells: list[tuple[str, np.ndarray]]) -> None:
+    """Refuse cells whose nodes are not among the ``count`` points of the mesh, or not different."""
+    for kind, block in cells:
+        if block.ndim != 2 or block.dtype.kind not in "iu":
+            raise ValueError(
+                f"mesh: cells of kind {kind!r} have shape {block.shape}; expected whole numbers (M, nodes)"
+            )
+        if block.min() < 0 or block.max() >= count:
+            raise ValueError(
+                f"mesh: cells of kind {kind!r} name nodes from {block.min()} to {block.max()}, but there are only the "
+                f"points 0 to {count - 1}; write the mesh again"
+            )
+        same = np.flatnonzero((np.diff(np.sort(block, axis=1), axis=1) == 0).any(axis=1))
+        if len(same):
+            raise ValueError(f"mesh: {kind!r} cell {same[0]} has a node twice, {block[same[0]].tolist()}; remove it")
 
 
 def outer_facets(points: np.ndarray, cells: list[tuple[str, np.ndarray]]) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -57,6 +77,10 @@ def outer_facets(points: np.ndarray, cells: list[tuple[str, np.ndarray]]) -> lis
     _, first, count = np.unique(np.concatenate(heads), axis=0, return_index=True, return_counts=True)
     outer = np.zeros(sum(map(len, heads)), bool)
     outer[first[count == 1]] = True
+    if not outer.any():
+        raise ValueError(
+            "mesh: no side of its cells is a boundary, as where every cell is given twice; remove the copies"
+        )
     masks = np.split(outer, np.cumsum([len(h) for h in heads])[:-1])
     return [(nodes[mask], centre[mask]) for nodes, centre, mask in zip(facets, centres, masks)]
 
@@ -107,8 +131,13 @@ def _add_normals(total: np.ndarray, points: np.ndarray, facets: np.ndarray, cent
     else:
         # The diagonals of a quadrilateral, two sides of a triangle.
         normal = np.cross(at[:, 2] - at[:, 0], at[:, -1] - at[:, 1])
-    normal = normal * np.sign(np.sum(normal * (at.mean(axis=1) - centres), axis=1, keepdims=True))
-    normal = normal / np.linalg.norm(normal, axis=1, keepdims=True)
+    length = np.linalg.norm(normal, axis=1, keepdims=True)
+    normal = normal / np.where(length > 0, length, 1.0)
+    outward = np.sum(normal * (at.mean(axis=1) - centres), axis=1, keepdims=True)
+    flat = np.flatnonzero(np.abs(outward[:, 0]) < 1e-14)  # the mesh has size one
+    if len(flat):
+        raise ValueError(f"mesh: a cell without volume has the nodes {facets[flat[0]].tolist()}; remove such cells")
+    normal = normal * np.sign(outward)
     for k in range(facets.shape[1]):
         angle = np.ones(len(facets))
         if dim == 3 and k < head.shape[1]:
@@ -137,7 +166,7 @@ def named_facets(mesh: Any, dim: int, tags: str | None) -> dict[str, np.ndarray]
         raise ValueError(f"tags: {tags!r} is none of the mesh's cell data {sorted(mesh.cell_data)}")
     for key in keys[:1]:
         names = {int(entry[0]): name for name, entry in mesh.field_data.items() if int(entry[1]) == dim - 1}
-        numbers = {k: np.asarray(mesh.cell_data[key][k]).astype(int).ravel() for k in facets}
+        numbers = {k: _whole(key, mesh.cell_data[key][k]) for k in facets}
         present = sorted(set().union(*map(set, numbers.values())) if numbers else (), key=_order_of(names))
         for number in present:
             nodes = [mesh.cells[k].data[numbers[k] == number].ravel() for k in facets]
@@ -150,6 +179,14 @@ def named_facets(mesh: Any, dim: int, tags: str | None) -> dict[str, np.ndarray]
     for name, members in mesh.point_sets.items():
         named.setdefault(name, []).append(np.asarray(members, int).ravel())
     return {name: np.concatenate(nodes) for name, nodes in named.items() if nodes}
+
+
+def _whole(key: str, values: Any) -> np.ndarray:
+    """Tags as integers."""
+    values = np.asarray(values).ravel()
+    if values.dtype.kind not in "iuf" or not (np.isfinite(values) & (values == np.round(values))).all():
+        raise ValueError(f"tags: the cell data {key!r} are no whole numbers; number the sides 1, 2, ...")
+    return values.astype(int)
 
 
 def _order_of(names: dict[int, str]) -> Any:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from jsmitsm.clouds import INTERIOR, Cloud
-from jsmitsm.facets import boundary_normals, named_facets, outer_facets, side_normals, volume_cells
+from jsmitsm.facets import boundary_normals, check_cells, named_facets, outer_facets, side_normals, volume_cells
 from jsmitsm.shapes import from_polygon
 from jsmitsm.simplices import simplices
 from jsmitsm.solution import Solution
@@ -59,11 +59,12 @@ def from_mesh(mesh: Any, tags: str | None = None) -> Cloud:
     Cloud(5 particles in 2D, groups {interior: 1, bottom: 2, side: 1, boundary: 1})
     """
     if isinstance(mesh, (str, os.PathLike)):
-        mesh = _needed("meshio", "mesh").read(mesh)
+        mesh = _read(mesh)
     if not (hasattr(mesh, "points") and hasattr(mesh, "cells")):
         raise ValueError(f"mesh: expected a meshio.Mesh or the path of a mesh file, got {type(mesh).__name__}")
-    points = np.asarray(mesh.points, dtype=np.float64)
     dim, cells = volume_cells(mesh.cells)
+    points = _checked_nodes(mesh.points, dim)
+    check_cells(len(points), cells)
     size = np.ptp(points, axis=0).max()
     if points.shape[1] > dim and np.ptp(points[:, dim:], axis=0).max() > 1e-12 * size:
         raise ValueError(
@@ -74,9 +75,13 @@ def from_mesh(mesh: Any, tags: str | None = None) -> Cloud:
     new = np.full(len(points), -1)
     new[used] = np.arange(len(used))
     points = np.ascontiguousarray(points[used, :dim])
+    # Products of coordinates must neither overflow nor vanish: the geometry is found in units of its size.
+    unit = float(np.ptp(points, axis=0).max()) or 1.0
+    corner = points.min(axis=0)
     cells = [(kind, new[block]) for kind, block in cells]
-    outer = outer_facets(points, cells)
-    normals = boundary_normals(points, outer)
+    scaled = (points - corner) / unit
+    outer = outer_facets(scaled, cells)
+    normals = boundary_normals(scaled, outer)
     free = np.isfinite(normals[:, 0])
     groups = {INTERIOR: np.flatnonzero(~free)}
     for name, nodes in named_facets(mesh, dim, tags).items():
@@ -91,11 +96,57 @@ def from_mesh(mesh: Any, tags: str | None = None) -> Cloud:
             members = np.zeros(len(points), bool)
             members[nodes] = True
             # At a corner between groups the normal is that of the own side: what is said of a side holds to its end.
-            own = side_normals(points, outer, members)[claimed]
+            own = side_normals(scaled, outer, members)[claimed]
             normals[claimed] = np.where(np.isfinite(own), own, normals[claimed])
     if free.any():
         groups["boundary"] = np.union1d(groups.get("boundary", np.zeros(0, int)), np.flatnonzero(free))
     return Cloud(points, groups, normals)
+
+
+def _checked_nodes(points: Any, dim: int) -> np.ndarray:
+    """The nodes of a mesh (N, D), real and finite, in at least as many axes as its cells have."""
+    array = np.asarray(points)
+    if array.dtype.kind not in "iuf" or array.ndim != 2 or array.shape[1] < dim:
+        raise ValueError(
+            f"mesh: its points have shape {array.shape} and type {array.dtype}; expected real numbers (N, D), D at "
+            f"least {dim} for its cells"
+        )
+    bad = np.flatnonzero(~np.isfinite(array).all(axis=1))
+    if len(bad):
+        raise ValueError(f"mesh: NaN or infinite coordinates at the points {bad[:5].tolist()}; remove or mend them")
+    return array.astype(np.float64)
+
+
+def _read(path: Any) -> Any:
+    """The mesh in a file; whatever meshio does with one that is damaged, which may be to end the program."""
+    meshio = _needed("meshio", "mesh")
+    if not os.path.isfile(path):
+        raise ValueError(f"mesh: there is no file {os.fspath(path)!r}; give the path of a mesh file")
+    with open(path, "rb") as file:
+        start = file.read(1)
+        file.seek(-min(os.path.getsize(path), 100), os.SEEK_END)
+        end = file.read().split()
+    kind = {b"$": "gmsh", b"(": "ansys"}.get(start) if os.fspath(path).endswith(".msh") else None
+    # Of such a file that ends too soon, or is of neither kind, meshio would look for the end for ever.
+    whole = end and (end[-1].startswith(b"$End") if kind == "gmsh" else end[-1].endswith(b")") or kind != "ansys")
+    if not whole:
+        raise ValueError(f"mesh: the file {os.fspath(path)!r} is {'cut short' if end else 'empty'}; write it again")
+    if kind is None and os.fspath(path).endswith(".msh"):
+        raise ValueError(
+            f"mesh: the file {os.fspath(path)!r} is of neither kind of .msh, Gmsh's or Ansys's; convert it"
+        )
+    try:
+        return meshio.read(path, kind)
+    except ModuleNotFoundError as error:
+        raise ImportError(
+            f"mesh: meshio needs {error.name} for {os.fspath(path)!r}: pip install {error.name}"
+        ) from None
+    except (Exception, SystemExit) as error:
+        what = f"{type(error).__name__}: {error}".strip(": ")
+        raise ValueError(
+            f"mesh: meshio cannot read {os.fspath(path)!r} ({what}); expected a whole file of a format that its "
+            "extension names (.msh, .vtk, .vtu, .inp, .xdmf, ...)"
+        ) from error
 
 
 def from_shapely(polygon: Any, spacing: Any, seed: int = 0, groups: Any = None) -> Cloud:
@@ -110,7 +161,13 @@ def from_shapely(polygon: Any, spacing: Any, seed: int = 0, groups: Any = None) 
     ['boundary', 'hole0', 'interior']
     """
     if isinstance(polygon, str):
-        polygon = _needed("shapely", "mesh").from_wkt(polygon)
+        shapely, text = _needed("shapely", "mesh"), polygon
+        try:
+            polygon = shapely.from_wkt(text)
+        except shapely.errors.ShapelyError as error:
+            raise ValueError(
+                f"polygon: {text!r} is no well-known text, as 'POLYGON ((0 0, 1 0, 0 1))' ({error})"
+            ) from None
     if not (hasattr(polygon, "exterior") and hasattr(polygon, "interiors")):
         kind = getattr(polygon, "geom_type", type(polygon).__name__)
         raise ValueError(f"polygon: expected a shapely Polygon, got {kind}; of a MultiPolygon pass one of .geoms")
@@ -132,15 +189,22 @@ def from_csv(path: Any) -> Cloud:
     >>> js.files.from_csv(path)
     Cloud(3 particles in 1D, groups {interior: 1, left: 1, right: 1})
     """
-    with open(path, newline="", encoding="utf-8-sig") as file:
-        rows = list(csv.DictReader(file, skipinitialspace=True))
+    try:
+        with open(path, newline="", encoding="utf-8-sig") as file:
+            rows = list(csv.DictReader(file, skipinitialspace=True))
+    except (OSError, TypeError) as error:
+        raise ValueError(f"path: cannot read {path!r} ({error}); give the path of a CSV file") from None
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise ValueError(f"path: {path} is no text in UTF-8 ({error}); save it as CSV in UTF-8") from None
     if not rows:
         raise ValueError(f"path: {path} has no rows below its header")
     axes = [name for name in _AXES if name in rows[0]]
     if "group" not in rows[0] or "".join(axes) not in ("x", "xy", "xyz"):
         raise ValueError(f"path: {path} has the columns {list(rows[0])}; expected x (and y, z) and group")
     points = _numbers(rows, axes, path)
-    names = [row["group"].strip() for row in rows]
+    names = [(row["group"] or "").strip() for row in rows]
+    if "" in names:
+        raise ValueError(f"path: {path}, line {names.index('') + 2}: has no group; expected {INTERIOR} or a name")
     groups = {name: np.flatnonzero([n == name for n in names]) for name in dict.fromkeys([INTERIOR, *names])}
     normals = [f"n{name}" for name in axes]
     return Cloud(points, groups, _numbers(rows, normals, path) if normals[0] in rows[0] else None)
@@ -152,7 +216,7 @@ def to_csv(what: Cloud | Solution, path: Any) -> None:
     ``what``: a cloud or a solution; ``path``: a name or a path. Numbers are written so that they read back to the
     last bit, see :func:`from_csv`.
     """
-    columns = _columns(what)
+    columns = _columns(_a_kind(what, (Cloud, Solution), "what"))
     with open(path, "w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(columns)
@@ -175,13 +239,10 @@ def to_mesh(sol: Solution, **more: Any) -> Any:
     (9,)
     """
     meshio = _needed("meshio", "mesh")
-    cloud = sol.cloud
+    cloud = _a_kind(sol, (Solution,), "sol").cloud
     points = np.zeros((len(cloud), 3))
     points[:, : cloud.dim] = cloud.points
-    data = {"u": np.asarray(sol.u)} | {name: np.asarray(value) for name, value in more.items()}
-    bad = [name for name, value in data.items() if len(value) != len(cloud)]
-    if bad:
-        raise ValueError(f"{bad[0]}: {len(data[bad[0]])} values came, expected {len(cloud)}, one per particle")
+    data = {"u": np.asarray(sol.u)} | _per_particle(more, len(cloud), (1, 2))
     return meshio.Mesh(points, [(_CELLS[cloud.dim], simplices(cloud))], point_data=data)
 
 
@@ -195,7 +256,8 @@ def to_pandas(what: Cloud | Solution, **more: Any) -> Any:
     >>> js.files.to_pandas(js.interval(0.0, 1.0, 3)).group.tolist()
     ['left', 'interior', 'right']
     """
-    return _needed("pandas", "tables").DataFrame({**_columns(what), **more})
+    columns = _columns(_a_kind(what, (Cloud, Solution), "what"))
+    return _needed("pandas", "tables").DataFrame({**columns, **_per_particle(more, len(columns["x"]), (1,), columns)})
 
 
 def to_xarray(sol: Solution, **more: Any) -> Any:
@@ -212,10 +274,11 @@ def to_xarray(sol: Solution, **more: Any) -> Any:
     9
     """
     xarray = _needed("xarray", "tables")
-    columns = _columns(sol.cloud)
+    columns = _columns(_a_kind(sol, (Solution,), "sol").cloud)
+    more = _per_particle(more, len(sol.cloud), (1,), columns)
     dims = ("particle", "field")[: np.ndim(sol.u)]
     return xarray.Dataset(
-        {"u": (dims, np.asarray(sol.u))} | {name: ("particle", np.asarray(value)) for name, value in more.items()},
+        {"u": (dims, np.asarray(sol.u))} | {name: ("particle", value) for name, value in more.items()},
         coords={name: ("particle", column) for name, column in columns.items()},
         attrs={"method": sol.method, "order": sol.order, "converged": int(bool(sol.converged))},
     )
@@ -227,6 +290,30 @@ def _needed(name: str, extra: str) -> Any:
         return importlib.import_module(name)
     except ImportError:
         raise ImportError(f'{name} is needed here, an optional extra: pip install "jsmitsm[{extra}]"') from None
+
+
+def _a_kind(what: Any, kinds: tuple[type, ...], name: str) -> Any:
+    """``what``, or an error where it is none of ``kinds``."""
+    if not isinstance(what, kinds):
+        wanted = " or ".join(f"js.{kind.__name__}" for kind in kinds)
+        raise ValueError(f"{name}: expected a {wanted}, got {type(what).__name__}")
+    return what
+
+
+def _per_particle(more: Mapping[str, Any], count: int, dims: tuple[int, ...], taken: Any = ()) -> dict[str, np.ndarray]:
+    """Further columns as arrays with a row for every particle."""
+    out = {}
+    for name, value in more.items():
+        array = np.asarray(value)
+        if array.ndim not in dims or len(array) != count or array.dtype.kind == "O":
+            raise ValueError(
+                f"{name}: values of shape {array.shape} came, expected {count}, one per particle"
+                + (", or rows of them" if 2 in dims else "")
+            )
+        if name in taken:
+            raise ValueError(f"{name}: is a column already ({', '.join(taken)}); give it another name")
+        out[name] = array
+    return out
 
 
 def _columns(what: Cloud | Solution) -> Mapping[str, np.ndarray]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from functools import cached_property
 from typing import Any
 
@@ -244,10 +245,12 @@ class Run:
         whole = linsolve.condition_estimate(self.factor)
         return health.condition_numbers(self.disc, self.nums), float(whole)
 
-    def flags(self) -> list[str]:
+    def flags(self, estimated: Callable[[], float]) -> list[str]:
         """What speaks against the solution, in sentences; see :mod:`jsmitsm.flags`."""
         failed = [m for m in self.messages if m.startswith(("FAILED", DOUBT))]
-        return failed if self.values is None or self.nums is None else flags(self, self.values, self.nums)[0] + failed
+        if self.values is None or self.nums is None:
+            return failed
+        return flags(self, self.values, self.nums, estimated)[0] + failed
 
     def stats(self) -> dict[str, Any]:
         """What a user may want to know about the solve."""

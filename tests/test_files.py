@@ -190,6 +190,82 @@ def test_bad_meshes_are_named():
             from_mesh(mesh)
 
 
+CORNERS = np.array([[0, 0], [1, 0], [1, 1], [0, 1], [0.5, 0.5]], float)
+FAN = ("triangle", [[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]])
+SIDE = ("line", [[0, 1]])
+
+
+def moved(value):
+    points = CORNERS.copy()
+    points[4, 0] = value
+    return points
+
+
+@pytest.mark.parametrize("points, cells, more, text", [
+    (moved(np.nan), [FAN], {}, r"mesh: NaN or infinite coordinates at the points \[4\].*remove"),
+    (moved(np.inf), [FAN], {}, r"mesh: NaN or infinite coordinates at the points \[4\].*remove"),
+    (CORNERS + 0j, [FAN], {}, "mesh: its points.*complex128.*real numbers"),
+    (CORNERS[:, :1], [FAN], {}, r"mesh: its points have shape \(5, 1\).*D at least 2"),
+    (CORNERS * 1e300, [FAN], {}, "coordinates of size 1e.300.*another unit of length"),
+    (CORNERS * 1e-300, [FAN], {}, "coordinates of size 1e-300.*another unit of length"),
+    (CORNERS, [("triangle", [[0, 1, 9]])], {}, "nodes from 0 to 9, but there are only the points 0 to 4; write the mesh"),
+    (CORNERS, [("triangle", [[0, 1, -1]])], {}, "nodes from -1 to 1"),
+    (CORNERS, [("triangle", [[0, 1, 1]])], {}, "has a node twice"),
+    ([*CORNERS, [0.5, 0.0]], [("triangle", [*FAN[1], [0, 5, 1]])], {}, "cell without volume has the nodes .*remove"),
+    (CORNERS, [FAN, FAN], {}, "given twice; remove the copies"),
+    (CORNERS, [("triangle", np.zeros((0, 3), int))], {}, "has no cells"),
+    (CORNERS, [("vertex", [[0]])], {}, "has no cells"),
+    (CORNERS, [("line", [[0, 4]])], {}, "1-dimensional but its points"),
+    (CORNERS, [("triangle10", [[0, 1, 2, 3, 4, 0, 1, 2, 3, 4]])], {}, "'triangle10' are not understood; save it"),
+    (CORNERS, [FAN, SIDE], {"cell_data": {"mark": [[1.0] * 4, [2.5]]}}, "tags: the cell data 'mark' are no whole numbers"),
+    (CORNERS, [FAN, SIDE], {"cell_data": {"mark": [[1.0] * 4, [np.nan]]}}, "tags: .* no whole numbers; number the sides"),
+    (CORNERS, [FAN, SIDE], {"cell_data": {"mark": [[1] * 4, [2]]}, "field_data": {"interior": np.array([2, 1])}},
+     "tagged 'interior'.*rename"),
+])  # fmt: skip
+@pytest.mark.filterwarnings("error")
+def test_a_damaged_mesh_is_refused(points, cells, more, text):
+    mesh = meshio.Mesh(points, cells, **more)
+    with pytest.raises(ValueError, match=f"(?s){text}"):
+        from_mesh(mesh, tags="mark" if more else None)
+
+
+@pytest.mark.filterwarnings("error")
+def test_odd_meshes_that_are_right():
+    """In another unit, far away, at another height; two kinds of cells."""
+    for points in (CORNERS * 1e-6, CORNERS + 1e6, np.pad(CORNERS, ((0, 0), (0, 1)), constant_values=3.0)):
+        cloud = from_mesh(meshio.Mesh(points, [FAN]))
+        assert cloud.groups["interior"].tolist() == [4] and len(cloud.groups["boundary"]) == 4
+    two = [("quad", [[0, 1, 2, 3]]), ("triangle", [[1, 4, 2]])]
+    assert len(from_mesh(meshio.Mesh([*CORNERS[:4], [2.0, 0.5]], two)).groups["boundary"]) == 5
+
+
+@pytest.mark.parametrize("name", ["a.msh", "a.vtk", "a.vtu", "a.inp", "a.xdmf", "a.su2", "a.unknown", "none"])
+@pytest.mark.filterwarnings("ignore")
+def test_what_is_no_mesh_file(name, tmp_path):
+    """meshio raises what it likes, ends the program, or never comes back from some of these."""
+    path = tmp_path / name
+    with pytest.raises(ValueError, match="mesh: there is no file.*give the path"):
+        from_mesh(path)
+    path.write_bytes(b"")
+    with pytest.raises(ValueError, match="mesh: the file.*is empty; write it again"):
+        from_mesh(path)
+    path.write_bytes(bytes(np.random.default_rng(0).integers(0, 256, 300, dtype=np.uint8)))
+    with pytest.raises(ValueError, match="(?s)mesh: .*(cannot read.*expected a whole file|convert it)"):
+        from_mesh(path)
+
+
+@pytest.mark.parametrize("form, kind", [("msh", "gmsh"), ("msh", "gmsh22"), ("vtk", "vtk"), ("vtu", "vtu")])
+def test_a_file_cut_short(form, kind, tmp_path):
+    path = tmp_path / f"whole.{form}"
+    meshio.Mesh(np.pad(CORNERS, ((0, 0), (0, 1))), [FAN]).write(path, file_format=kind)
+    assert len(from_mesh(path)) == 5
+    whole = path.read_bytes()
+    for part in (0.05, 0.3, 0.6, 0.9):
+        path.write_bytes(whole[: int(part * len(whole))])
+        with pytest.raises(ValueError, match="mesh: .*(cut short|cannot read|has no cells|name nodes)"):
+            from_mesh(path)
+
+
 def test_shapely_polygon_and_text():
     shapely = pytest.importorskip("shapely")
     ring = shapely.Point(0, 0).buffer(1.0).difference(shapely.box(-0.3, -0.3, 0.3, 0.3))
@@ -203,6 +279,8 @@ def test_shapely_polygon_and_text():
         from_shapely(shapely.MultiPolygon([shapely.box(0, 0, 1, 1), shapely.box(2, 2, 3, 3)]), 0.1)
     with pytest.raises(ValueError, match="is empty"):
         from_shapely(shapely.Polygon(), 0.1)
+    with pytest.raises(ValueError, match="polygon: 'ring' is no well-known text, as 'POLYGON"):
+        from_shapely("ring", 0.1)
 
 
 @pytest.mark.parametrize("cloud", [js.interval(0, 1 / 3, 4), js.rectangle((0, 0), (1, 2), (4, 5), jitter=0.3)], ids=str)
@@ -222,10 +300,44 @@ def test_bad_csv_is_named(tmp_path):
         ("x,group\n0,left\none,interior\n", "line 3: x = 'one' is no number"),
         ("x,group\n", "no rows"),
         ("x,group\n0,left\n,interior\n", "NaN or infinite"),
+        ("x,group\n1e999,left\n1,interior\n", "NaN or infinite.*remove"),
+        ("x,group\n0,left\n0,interior\n", "duplicate.*keep one"),
+        ("x,y,group\n0,0,left\n1\n", "line 3: has no group; expected interior"),
+        ("x,group\n0,\n1,interior\n", "line 2: has no group"),
+        ("x;group\n0;left\n", "expected x .and y, z. and group"),
+        ("x,z,group\n0,0,left\n", "expected x .and y, z. and group"),
+        ("x,group,nx\n0,left,abc\n1,interior,\n", "line 2: nx = 'abc' is no number"),
+        ("x,group,nx\n0,left,-3\n1,interior,\n", "normals: not of unit length.*divide by"),
+        ('x,group\n"0,5",left\n1,interior\n', "line 2: x = '0,5' is no number"),
+        ("", "no rows"),
     ):
         path.write_text(text)
         with pytest.raises(ValueError, match=message):
             from_csv(path)
+    path.write_bytes("x,group\n0,left\n".encode("utf-16"))
+    with pytest.raises(ValueError, match="path: .*no text in UTF-8.*save it as CSV"):
+        from_csv(path)
+    for wrong in (tmp_path / "missing.csv", tmp_path, None, 3.5):
+        with pytest.raises(ValueError, match="path: cannot read.*give the path of a CSV file"):
+            from_csv(wrong)
+
+
+def test_bad_columns_are_named():
+    ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(1.0)}
+    sol = js.solve(js.Problem(lambda u, x: js.laplacian(u)(x), ends), js.interval(0.0, 1.0, 9), order=3)
+    pytest.importorskip("pandas")
+    pytest.importorskip("xarray")
+    for write in (to_mesh, to_pandas, to_xarray):
+        for value in (np.ones(3), 1.0, "text", None, np.ones((8, 9))):
+            with pytest.raises(ValueError, match="e: values of shape .* came, expected 9, one per particle"):
+                write(sol, e=value)
+        with pytest.raises(ValueError, match="expected a .*js.Solution, got int"):
+            write(3)
+    for write in (to_pandas, to_xarray):
+        with pytest.raises(ValueError, match="x: is a column already.*another name"):
+            write(sol, x=np.ones(9))
+    with pytest.raises(ValueError, match="what: expected a js.Cloud or js.Solution, got ndarray"):
+        to_csv(sol.u, "nowhere.csv")
 
 
 def test_tables():

@@ -52,11 +52,55 @@ def test_waves_too_short_for_the_cloud():
 
 
 def test_a_large_estimate_is_a_flag():
+    """Asked for where a cheap test suspects, and counted where it was asked for by hand: of a system, for instance."""
     wave = lambda x: jnp.sin(22 * x[0]) * jnp.cos(17 * x[1])
     sol = js.solve(posed(laplace, wave), square(11), order=2)
+    assert len(sol.flags) > 1 and "estimated error" in sol.flags[-1]
+    two = js.Problem(
+        lambda u, x: jnp.stack([js.laplacian(u[k])(x) - js.laplacian(wave)(x) for k in range(2)]),
+        {side: [js.dirichlet(wave, field=k) for k in range(2)] for side in SIDES},
+        fields=2,
+    )
+    sol = js.solve(two, square(11), order=2)
     before = sol.flags
     sol.error_estimate()
     assert len(sol.flags) == len(before) + 1 and "estimated error" in sol.flags[-1]
+
+
+def front(width, **options):
+    """A steep front between particles of a line: its source has two signs, its values change little by little."""
+    front = lambda x: jnp.tanh((x[0] - 0.506) / width)
+    ends = {side: js.dirichlet(front) for side in ("left", "right")}
+    line = js.interval(0.0, 1.0, 41)
+    sol = js.solve(js.Problem(lambda u, x: js.laplacian(u)(x) - js.laplacian(front)(x), ends), line, **options)
+    exact = np.asarray(jax.vmap(front)(jnp.asarray(line.points)))
+    return sol, np.linalg.norm(sol.u - exact) / np.linalg.norm(exact)
+
+
+def test_a_front_that_the_cheap_tests_hardly_see():
+    """It stays below their bounds, and the estimate, asked for from a third of them on, confirms it."""
+    sol, error = front(0.005, order=6)
+    assert error > 1.0 and any("estimated error" in flag for flag in sol.flags)
+
+
+def test_a_layer_that_the_solution_follows_is_no_flag():
+    """eps^2 u'' = u with eps a tenth of the spacing: the values fall to nothing within one spacing, and rightly."""
+    eps = 0.1 / 40
+    layer = lambda x: jnp.exp(-x[0] / eps) + jnp.exp((x[0] - 1.0) / eps)
+    ends = {side: js.dirichlet(layer) for side in ("left", "right")}
+    sol = js.solve(js.Problem(lambda u, x: eps**2 * js.laplacian(u)(x) - u(x), ends), js.interval(0.0, 1.0, 41))
+    assert sol.flags == []
+    exact = np.asarray(jax.vmap(layer)(jnp.asarray(sol.cloud.points)))
+    assert np.linalg.norm(sol.u - exact) < 0.01 * np.linalg.norm(exact)
+
+
+def test_least_squares_squares_the_operator():
+    """u_xy from two sides at order 6 has a condition of 4e7 on 17 x 17 particles, and six digits."""
+    sides = {side: js.free() for side in SIDES} | {side: js.dirichlet(smooth) for side in ("left", "bottom")}
+    cross = lambda u, x: js.partial(u, (1, 1))(x)
+    sol = js.solve(js.Problem(lambda u, x: cross(u, x) - cross(smooth, x), sides), square(25), order=6)
+    assert sol.stats["formulation"] == "lsq" and sol.flags == []
+    assert np.abs(sol.u - jax.vmap(smooth)(sol.cloud.points)).max() < 1e-4
 
 
 def test_flags_survive_pickling():
