@@ -81,9 +81,14 @@ def assembly_memory(entries: int) -> int:
     return 90 * int(entries)
 
 
-def refuse_too_large(n: int, entries: int, points: np.ndarray | None, solver: str, elliptic: bool) -> None:
-    """Raise SolveError where a system of n unknowns would not fit in memory, before any of it is made."""
-    needed, there = assembly_memory(entries), _memory()
+def refuse_too_large(
+    n: int, entries: int, points: np.ndarray | None, solver: str, elliptic: bool, made: int | None = None
+) -> None:
+    """Raise SolveError where a system of n unknowns would not fit in memory, before any of it is made.
+
+    entries: of its matrix; made: those of the matrix and of what it is assembled from, where they are more.
+    """
+    needed, there = assembly_memory(entries if made is None else made), _memory()
     if needed > 0.8 * there:
         raise SolveError(
             f"the rows and the matrix would need about {needed / 1e9:.2g} GB for {n} unknowns, of {there / 1e9:.2g} GB "
