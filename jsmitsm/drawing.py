@@ -8,7 +8,9 @@ from typing import Any
 import jax
 import numpy as np
 
+from jsmitsm.boundary import is_traced
 from jsmitsm.clouds import Cloud
+from jsmitsm.kernels import Kernel
 from jsmitsm.neighbours import Stencils, within
 from jsmitsm.simplices import cut, refined, simplices
 from jsmitsm.solution import Solution
@@ -38,9 +40,29 @@ def axes(given: Any, dim: int, size: tuple[float, float] = (5.6, 4.2)) -> Any:
         return pyplot().subplots(figsize=size, layout="constrained", subplot_kw=projection)[1]
     if isinstance(given, (list, tuple, np.ndarray)):
         raise ValueError(f"ax: one axes is needed, {np.size(given)} came; pass one of them")
+    _check_axes(given)
     if dim == 3 and not hasattr(given, "get_zlim"):
         raise ValueError('ax: three-dimensional axes are needed; make them with subplot_kw={"projection": "3d"}')
     return given
+
+
+def _check_axes(given: Any) -> None:
+    if not hasattr(given, "set_xlabel"):
+        raise ValueError(f"ax: expected axes of matplotlib, as plt.subplots() makes them, got {type(given).__name__}")
+
+
+def real(name: str, numbers: Any) -> np.ndarray:
+    """Numbers as an array of floats, of a size that the arithmetic of a picture can bear."""
+    if is_traced(numbers):
+        raise ValueError(f"{name}: is traced by a JAX transform; draw outside of it")
+    array = np.asarray(numbers)
+    if array.dtype.kind not in "biuf":
+        raise ValueError(f"{name}: expected real numbers, got {array.dtype}")
+    if np.nanmax(np.abs(array), initial=0.0) > 1e150 and np.isfinite(array).all():
+        raise ValueError(
+            f"{name}: numbers of size {np.abs(array).max():.0e} cannot be drawn; use another unit, or log10"
+        )
+    return array.astype(float)
 
 
 def panels(given: Any, count: int, size: tuple[float, float], rows: bool = False) -> np.ndarray:
@@ -48,6 +70,8 @@ def panels(given: Any, count: int, size: tuple[float, float], rows: bool = False
     if given is not None:
         if np.size(given) != count:
             raise ValueError(f"ax: this picture has {count} panel(s), {np.size(given)} axes came; pass {count}")
+        for one in np.atleast_1d(np.asarray(given, dtype=object)).ravel():
+            _check_axes(one)
         return np.atleast_1d(np.asarray(given, dtype=object)).ravel()
     shape, both = ((count, 1), (size[0], size[1] * count)) if rows else ((1, count), (size[0] * count, size[1]))
     return pyplot().subplots(*shape, figsize=both, layout="constrained", squeeze=False, sharex=rows)[1].ravel()
@@ -85,11 +109,11 @@ def gapped(pieces: np.ndarray) -> np.ndarray:
 
 def field_of(numbers: Any, field: int) -> np.ndarray:
     """One field (N,) of values (N,) or (N, F)."""
-    array = np.asarray(numbers, dtype=float)
+    array = real("numbers", numbers)
     if array.ndim < 2:
         return array
-    if not 0 <= field < array.shape[1]:
-        raise ValueError(f"field: {field}, but the solution has fields 0 to {array.shape[1] - 1}")
+    if not isinstance(field, (int, np.integer)) or not 0 <= field < array.shape[1]:
+        raise ValueError(f"field: {field!r}, but the solution has fields 0 to {array.shape[1] - 1}")
     return array[:, field]
 
 
@@ -149,10 +173,12 @@ def draw_normals(ax: Any, cloud: Cloud, place: np.ndarray) -> None:
 def draw_support(ax: Any, cloud: Cloud, place: np.ndarray, particle: int, kernel: Any, found: Any,
                  size: float) -> None:  # fmt: skip
     """One particle, its neighbours ringed, and the ball of its kernel; ``size`` is that of the dots."""
-    if not 0 <= particle < len(cloud):
-        raise ValueError(f"support: particle {particle}, but the cloud has particles 0 to {len(cloud) - 1}")
+    if not isinstance(particle, (int, np.integer)) or not 0 <= particle < len(cloud):
+        raise ValueError(f"support: particle {particle!r}, but the cloud has particles 0 to {len(cloud) - 1}")
     if kernel is None and found is None:
         raise ValueError("support: pass kernel=..., stencils=... or a Solution in place of the cloud")
+    if kernel is not None and not isinstance(kernel, Kernel):
+        raise ValueError(f"kernel: expected a kernel such as js.SuperGaussian(h, d), got {kernel!r}")
     radius = None if kernel is None else float(kernel.d * kernel.at(particle).h)
     if found is None:
         found = within(np.asarray(cloud.points), radius, np.array([particle]))
@@ -204,6 +230,11 @@ def maps(cloud: Cloud, numbers: np.ndarray, anywhere: Callable | None, at: Mappi
     plt = pyplot()
     from matplotlib.ticker import FuncFormatter, MaxNLocator
 
+    if not isinstance(levels, (int, np.integer)) or levels < 0:
+        raise ValueError(f"levels: expected a number of contour levels, such as 20, got {levels!r}")
+    if not np.isfinite(numbers).all():
+        raise ValueError("sol: has values that are not finite, and did not converge; see sol.diagnose()")
+
     pieces = [_piece(cloud, numbers, anywhere, *where) for where in _places(cloud, at)]
     if log:
         low = floor(np.concatenate([z for *_, z in pieces]))
@@ -243,7 +274,7 @@ def page(points: np.ndarray) -> tuple[float, float]:
     if points.shape[1] != 2:
         return (5.6, 1.6) if points.shape[1] == 1 else (7.6, 5.0)
     width, height = np.ptp(points, axis=0)
-    ratio = float(np.clip(height / width, 0.3, 2.2))
+    ratio = float(np.clip(height / width, 0.3, 2.2)) if width > 0 else 1.0 if height == 0 else 2.2
     wide = 4.6 if ratio < 1 else 4.6 / ratio
     return wide + 1.3, wide * ratio + 0.5
 
@@ -261,6 +292,9 @@ def _places(cloud: Cloud, at: Mapping[str, float] | None) -> list[tuple[int, flo
         return [(k, float(np.round((lo[k] + hi[k]) / 2, digits)) + 0.0) for k in (2, 1, 0)]
     if not isinstance(at, Mapping) or not at or set(at) - set(_NAMES):
         raise ValueError(f'at: {at!r} is not a dict of positions by axis, such as {{"x": 0.5, "z": 0.2}}')
+    for name, position in at.items():
+        if not isinstance(position, (int, float, np.number)):
+            raise ValueError(f"at: expected a number for {name!r}, got {position!r}")
     return [(_NAMES.index(name), float(position)) for name, position in at.items()]
 
 

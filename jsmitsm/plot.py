@@ -148,7 +148,9 @@ def values(cloud: Cloud, numbers: Any, *, log: bool = False, label: str = "", at
     >>> square = js.rectangle((0, 0), (1, 1), (6, 6))
     >>> ax = js.plot.values(square, square.points[:, 0] ** 2, label="x squared")
     """
-    numbers = np.asarray(numbers, dtype=float)
+    if not isinstance(cloud, Cloud):
+        raise ValueError(f"cloud: expected a js.Cloud, got {type(cloud).__name__}")
+    numbers = drawing.real("numbers", numbers)
     if numbers.shape != (len(cloud),):
         raise ValueError(f"numbers: expected shape ({len(cloud)},), one per particle, got {numbers.shape}")
     if not np.isfinite(numbers).all():
@@ -180,7 +182,7 @@ def error(sol: Solution, exact: Any, *, field: int = 0, log: bool = True, ax: An
     >>> ax = js.plot.error(js.solve(problem, js.interval(0.0, 1.0, 9), order=2), lambda x: x[0] ** 4)
     """
     truth = drawing.at_points(exact, np.asarray(sol.cloud.points)) if callable(exact) else exact
-    truth = drawing.field_of(truth, field)
+    truth = drawing.field_of(drawing.real("exact", truth), field)
     if truth.shape != (len(sol.cloud),):
         raise ValueError(f"exact: expected {len(sol.cloud)} numbers, one per particle, got shape {truth.shape}")
     numbers = np.abs(drawing.field_of(sol.u, field) - truth)
@@ -250,6 +252,8 @@ def tuning(result: Any, *, ax: Any = None) -> Any:
     >>> axes = js.plot.tuning({"objective": [1e-2, 3e-3, 2e-3], "h": [0.10, 0.09, 0.085], "d": [4.0, 3.9, 3.9]})
     """
     history = getattr(result, "history", result)
+    if not isinstance(history, (Mapping, list, tuple)) or not len(history):
+        raise ValueError(f"result: expected what js.tune returned or its history, got {type(result).__name__}")
     if not isinstance(history, Mapping):  # one record per step
         history = {name: [step[name] for step in history] for name in history[0]}
     if "objective" not in history:

@@ -139,7 +139,8 @@ class Solution:
         With ``blend`` the polynomials' derivatives are averaged. Raises ValueError for wrong points or orders.
         """
         points = _checked_points(points, self.cloud.dim)
-        b = tuple(int(v) for v in multi_index)
+        whole = isinstance(multi_index, (tuple, list)) and all(isinstance(v, (int, np.integer)) for v in multi_index)
+        b = tuple(map(int, multi_index)) if whole else ()
         if len(b) != self.cloud.dim or min(b) < 0 or sum(b) > self.order:
             raise ValueError(
                 f"multi_index: expected {self.cloud.dim} non-negative orders with a sum of at most {self.order}, "

@@ -3,6 +3,8 @@
 import subprocess
 import sys
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -251,3 +253,53 @@ def test_a_particle_just_behind_a_notch_does_not_bridge_it():
     # One spacing of the rim, 0.036: triangles in the very corner of the notch may stay.
     across = points[cells[(points[cells].mean(axis=1) > 0.5).all(axis=1)]]
     assert not len(across) or across.max() < 0.5 + 2.1 / 28
+
+
+ONE, FLAT = js.Cloud([[0.5, 0.5]], {"interior": [0]}), js.rectangle((0, 0), (1, 1), (6, 6))
+
+
+def flat():
+    zero = {side: js.dirichlet(0.0) for side in FLAT.groups if side != "interior"}
+    return js.solve(js.Problem(lambda u, x: js.laplacian(u)(x) - 1.0, zero), FLAT, order=2)
+
+
+@pytest.mark.filterwarnings("error")
+def test_what_cannot_be_drawn_is_named():
+    sol, plot = flat(), js.plot
+    for call, text in (
+        (lambda: plot.values(FLAT, np.ones(36) * 1j), "numbers: expected real numbers, got complex128"),
+        (lambda: plot.values(FLAT, ["a"] * 36), "numbers: expected real numbers"),
+        (lambda: plot.values(FLAT, np.linspace(1e300, 1.7e308, 36)), "numbers of size 2e.308.*another unit"),
+        (lambda: plot.values(FLAT, np.full(36, np.nan)), "NaN or infinite at 36 particles; set them"),
+        (lambda: plot.values(FLAT, np.ones(3)), r"expected shape \(36,\)"),
+        (lambda: plot.values(None, np.ones(3)), "cloud: expected a js.Cloud, got NoneType"),
+        (lambda: plot.values(ONE, [1.0]), "1 particles make no 2D simplex; add"),
+        (lambda: jax.jit(lambda q: plot.values(FLAT, q * jnp.ones(36)))(1.0), "traced by a JAX transform; draw outside"),
+        (lambda: plot.error(sol, "x"), "exact: expected real numbers"),
+        (lambda: plot.error(sol, np.ones(36) * 1j), "exact: expected real numbers"),
+        (lambda: plot.error(sol, np.ones(3)), "exact: expected 36 numbers"),
+        (lambda: plot.solution(sol, levels="many"), "levels: expected a number of contour levels.*'many'"),
+        (lambda: plot.solution(sol, ax=3), "ax: expected axes of matplotlib.*got int"),
+        (lambda: plot.solution(sol, at={"x": 0.5}), "at: slices are for 3D clouds"),
+        (lambda: plot.solution(None), "sol: expected a js.Solution, got NoneType"),
+        (lambda: plot.cloud(sol, support="first"), "support: particle 'first', but.*0 to 35"),
+        (lambda: plot.cloud(sol, support=1.5), "support: particle 1.5, but.*0 to 35"),
+        (lambda: plot.cloud(FLAT, support=3, kernel="gauss"), "kernel: expected a kernel such as.*'gauss'"),
+        (lambda: plot.cloud(FLAT.points), "what: expected a js.Cloud or a js.Solution"),
+        (lambda: plot.tuning(None), "result: expected what js.tune returned.*NoneType"),
+        (lambda: plot.tuning([]), "result: expected what js.tune returned"),
+        (lambda: sol.derivative([[0.5, 0.5]], 1), "multi_index: expected 2 non-negative orders.*got 1"),
+        (lambda: sol.derivative([[0.5, 0.5]], "xy"), "multi_index: expected 2 non-negative orders"),
+        (lambda: sol.derivative([[0.5, 0.5]], (0.5, 0)), "multi_index: expected 2 non-negative orders"),
+    ):
+        with pytest.raises(ValueError, match=text):
+            call()
+
+
+@pytest.mark.filterwarnings("error")
+def test_odd_clouds_that_can_be_drawn():
+    """One particle, one value everywhere, nothing positive on a logarithmic scale."""
+    js.plot.cloud(ONE)
+    js.plot.values(FLAT, np.full(36, 3.0))
+    js.plot.values(FLAT, -np.ones(36), log=True)
+    js.plot.error(flat(), np.asarray(flat().u))
