@@ -100,9 +100,11 @@ def mul(ring: Ring, x: Array, y: Array) -> Array:
         return pairing(x, y, product(ring.dim, left, right, 0, degree))
     shape = np.broadcast_shapes(x.shape[1:], y.shape[1:])
     out = np.zeros((count(ring.dim, degree), *shape), np.result_type(x, y))
-    for a, (n, places) in enumerate(product_rows(ring.dim, left, right, degree)):
-        if n and np.any(x[a]):
-            out[places] += x[a] * y[:n]
+    # What is not finite is refused by name, with its particles, where the numbers are used.
+    with np.errstate(over="ignore", invalid="ignore"):
+        for a, (n, places) in enumerate(product_rows(ring.dim, left, right, degree)):
+            if n and np.any(x[a]):
+                out[places] += x[a] * y[:n]
     return out
 
 

@@ -13,6 +13,9 @@ import pytest
 
 import jsmitsm as js
 
+# No warning of numpy's about its own arithmetic reaches the user: the error says what is wrong.
+pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
+
 LINE = js.interval(0.0, 1.0, 9)
 SQUARE = js.rectangle((0, 0), (1, 1), (5, 5))
 BARE = js.Cloud(LINE.points, LINE.groups)
