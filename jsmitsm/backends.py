@@ -19,7 +19,7 @@ import numpy as np
 
 from jsmitsm.progress import bar
 
-ITERATIVE = ("amg", "ilu", "float32 factors")
+ITERATIVE = ("amg", "device amg", "ilu", "float32 factors")
 
 
 @cache
@@ -266,6 +266,12 @@ class Mixed(Krylov):
         return guess
 
 
+def _device_amg(matrix: Any) -> Any:
+    from jsmitsm.ondevice import DeviceAMG
+
+    return DeviceAMG(matrix)
+
+
 BACKENDS: dict[str, Callable[[Any], Any]] = {
     "lapack": Lapack,
     "nested dissection": lambda matrix: SuperLU(matrix, ordered=True),
@@ -273,5 +279,6 @@ BACKENDS: dict[str, Callable[[Any], Any]] = {
     "float32 factors": Mixed,
     "colamd": lambda matrix: SuperLU(matrix, ordered=False),
     "amg": AMG,
+    "device amg": _device_amg,
     "ilu": ILU,
 }

@@ -15,6 +15,7 @@ import time
 from functools import cache, partial
 from typing import Any
 
+import jax
 import numpy as np
 
 from jsmitsm.backends import BACKENDS, ITERATIVE, SuperLU, installed
@@ -159,7 +160,7 @@ class Factor:
             "messages": self.messages,
         }
         self._backends = choose_backends(n, len(data), points, solver, elliptic)
-        rows_only = self._backends[0] in ("amg", "ilu")  # multigrid lives on what is left of the symmetry
+        rows_only = self._backends[0] in ("amg", "device amg", "ilu")  # multigrid lives on what is left of the symmetry
         self.row_scale, self.col_scale = _scales(data, rows, cols, n, columns=not rows_only)
         scaled = data * self.row_scale[rows] * self.col_scale[cols]
         started = time.perf_counter()
@@ -353,10 +354,11 @@ def choose_backends(n: int, nnz: int, points: np.ndarray | None, solver: str, el
         direct = ["pardiso", "colamd"]
     needed, there = estimate_memory(n, nnz, dim), _memory()
     too_large = needed > 0.8 * there
-    iterative = ["amg"] if installed("pyamg") else ["ilu"]
+    multigrid = "amg" if jax.default_backend() == "cpu" else "device amg"
+    iterative = [multigrid] if installed("pyamg") else ["ilu"]
     bordered = points is not None and bool(np.isnan(points).any())
     if solver == "auto" and elliptic and not bordered:
-        if too_large or (n >= ITERATIVE_MIN.get(dim, n + 1) and iterative == ["amg"]):
+        if too_large or (n >= ITERATIVE_MIN.get(dim, n + 1) and iterative == [multigrid]):
             solver = "iterative"
         elif n >= MIXED_MIN and direct[0] == "nested dissection":
             solver = "mixed"

@@ -56,3 +56,22 @@ def test_without_the_options_of_the_cpu(monkeypatch):
     assert compiled, "a program of its own"
     for sol in (again, there):
         np.testing.assert_allclose(sol.u, here.u, rtol=1e-11, atol=1e-15)
+
+
+def test_multigrid_on_another_device(monkeypatch):
+    """The cycle and the iteration in JAX, forward and adjoint, against LU."""
+    cloud = js.rectangle((0, 0), (1, 1), (31, 31), jitter=0.3)
+    near = js.stencils(cloud, size=20)
+    problem = lambda c: js.Problem(lambda u, x: js.laplacian(u)(x) + c * jax.numpy.exp(x[0]), ENDS)
+    here = js.solve(problem(1.0), cloud, order=4, solver="sparse")
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    there = js.solve(problem(1.0), cloud, order=4, solver="iterative")
+    assert there.stats["linear"]["backend"] == "device amg" and not there.stats["linear"]["messages"]
+    assert 5 < there.stats["linear"]["iterations"] < 40
+    np.testing.assert_allclose(there.u, here.u, rtol=1e-11, atol=1e-15)
+
+    def mean(c):
+        return jax.numpy.mean(js.solve(problem(c), cloud, order=4, stencils=near, solver="iterative").u)
+
+    value, slope = jax.value_and_grad(mean)(2.0)
+    np.testing.assert_allclose(slope, value / 2.0, rtol=1e-10)  # linear in c
