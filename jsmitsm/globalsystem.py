@@ -14,6 +14,7 @@ from jsmitsm.layout import Class, Discretization, sorted_classes, table
 from jsmitsm.moments import Row
 from jsmitsm.neighbours import Stencils
 from jsmitsm.numbers import Numbers
+from jsmitsm.program import in_one_program
 from jsmitsm.progress import each
 from jsmitsm.recursion import Recursion
 from jsmitsm.rows import operands, pieces, right_sides, shared_elimination
@@ -23,6 +24,7 @@ def matrix(disc: Discretization, classes: list[Class], rows: list[Row]) -> tuple
     """The global matrix as coordinates: own u_i - sum_g weights u_g over the unknowns."""
     unknown, fields = disc.unknowns, disc.rec.fields
     parts: list[Any] = []
+    places: list[Any] = []
     for cls, row in zip(classes, rows):
         near = disc.images.owners(cls.neighbours)
         xp: Any = jnp if is_traced(near) else np
@@ -42,13 +44,21 @@ def matrix(disc: Discretization, classes: list[Class], rows: list[Row]) -> tuple
                 )
             )
         else:
-            place = np.flatnonzero(keep)
-            weights = row.weights.reshape(-1) if is_traced(row.weights) else np.asarray(row.weights).reshape(-1)
-            parts.append((-weights[place], r.reshape(-1)[place], c.reshape(-1)[place]))
-    n = int(unknown.max(initial=-1)) + 1
-    if disc.scheme.method != "SSPH":
-        parts.append((np.ones(n), np.arange(n), np.arange(n)))
-    return _joined(parts)
+            places.append(np.flatnonzero(keep))
+            parts.append((row.weights, *(x.reshape(-1)[places[-1]] for x in (r, c))))
+    n = int(unknown.max(initial=-1)) + 1 if disc.scheme.method != "SSPH" else 0
+    ones, every = np.ones(n), np.arange(n)
+    if not places:
+        return _joined([*parts, (ones, every, every)])
+    weights, at, to = zip(*parts)
+    return _entries(weights, places, ones), np.concatenate([*at, every]), np.concatenate([*to, every])
+
+
+@in_one_program
+def _entries(weights: Sequence[Any], places: Sequence[np.ndarray], diagonal: np.ndarray) -> Any:
+    """The entries of the matrix: the weights at their places, negative, and the diagonal of ones."""
+    xp = jnp if is_traced(weights) else np
+    return xp.concatenate([*(-xp.asarray(w).reshape(-1)[at] for w, at in zip(weights, places)), diagonal])
 
 
 def _joined(parts: Sequence[tuple[Any, Any, Any]]) -> tuple[Any, Any, Any]:
@@ -64,22 +74,30 @@ def right_side(disc: Discretization, nums: Numbers, classes: list[Class], rows: 
     unknown = disc.unknowns
     parts, places = [], []
     for cls, row in zip(classes, rows):
-        xp = jnp if is_traced(nums.source, nums.given, nums.held, nums.gamma, row, cls.neighbours) else np
         source, given = right_sides(disc, nums, cls)
-        w, v, v_own = (xp.asarray(x) for x in (row.weights, row.source, row.condition))
-        index = xp.maximum(disc.images.owners(cls.neighbours), 0)
-        total = xp.einsum("nfk,nk->nf", v_own, given) + row.constant
-        if cls.scheme.sourced:
-            total = total + xp.einsum("nfr,nr->nf", v, source)
-        total = total + xp.einsum("nfgh,ngh->nf", w, xp.asarray(nums.held)[index])
-        if disc.scheme.n_data:
-            total = total + xp.einsum("nfgd,ngd->nf", xp.asarray(row.data), xp.asarray(nums.gamma)[index])
+        near = disc.images.owners(cls.neighbours)
         own = unknown[cls.ids]
-        parts.append(total.reshape(-1)[np.flatnonzero(own >= 0)])
+        parts.append((row, source if cls.scheme.sourced else None, given, near, np.flatnonzero(own >= 0)))
         places.append(own[own >= 0])
-    xp = jnp if is_traced(parts) else np
-    order = np.argsort(np.concatenate(places)) if places else np.zeros(0, int)
-    return xp.concatenate(parts)[order] if parts else np.zeros(0)
+    return _loads(parts, nums.held, nums.gamma, np.argsort(np.concatenate(places))) if parts else np.zeros(0)
+
+
+@in_one_program
+def _loads(parts: Sequence[Any], held: Any, gamma: Any, order: np.ndarray) -> Any:
+    """The right-hand side from every class's row, source, own conditions, neighbours and places."""
+    xp = jnp if is_traced(parts, held, gamma) else np
+    found = []
+    for row, source, given, near, free in parts:
+        w, v, v_own, data = (xp.asarray(x) for x in (row.weights, row.source, row.condition, row.data))
+        index = xp.maximum(near, 0)
+        total = xp.einsum("nfk,nk->nf", v_own, given) + row.constant
+        if source is not None:
+            total = total + xp.einsum("nfr,nr->nf", v, source)
+        total = total + xp.einsum("nfgh,ngh->nf", w, xp.asarray(held)[index])
+        if gamma.shape[1]:
+            total = total + xp.einsum("nfgd,ngd->nf", data, xp.asarray(gamma)[index])
+        found.append(total.reshape(-1)[free])
+    return xp.concatenate(found)[order]
 
 
 def misfit(disc: Discretization, nums: Numbers, fits: list[Any], values: Any) -> np.ndarray:
@@ -152,6 +170,7 @@ def prefers_least_squares(disc: Discretization, nums: Numbers) -> bool:
     There a value predicted by neighbours on all sides is the wrong global form.
     """
     rec, jac = disc.rec, concrete(nums.jac)
+    jac = None if jac is None else np.asarray(jac)  # where it only carries derivatives, no operation is recorded
     orders = {rec.order - q for q in rec.degrees}
     if disc.scheme.method != "S" or rec.fields > 1:
         return False
@@ -225,9 +244,16 @@ def wave_number(disc: Discretization, nums: Numbers) -> float:
 
 def with_held(disc: Discretization, nums: Numbers, x: Any) -> Any:
     """All values (N, F) from the unknowns x (n,)."""
-    place = np.flatnonzero(~disc.held.reshape(-1))
-    if is_traced(x, nums.held):
-        return jnp.asarray(nums.held).reshape(-1).at[place].set(x).reshape(disc.held.shape)[disc.partner]
-    values = np.array(nums.held).reshape(-1)
-    values[place] = x
-    return values.reshape(disc.held.shape)[disc.partner]
+    return _inserted(nums.held, np.flatnonzero(~disc.held.reshape(-1)), x, disc.partner)
+
+
+@in_one_program
+def _inserted(held: Any, place: np.ndarray, x: Any, partner: np.ndarray) -> Any:
+    """The unknowns x put at their places among all values, and every value taken from its partner."""
+    values: Any
+    if is_traced(held, x):
+        values = jnp.asarray(held).reshape(-1).at[place].set(x)
+    else:
+        values = np.array(held).reshape(-1)
+        values[place] = x
+    return values.reshape(held.shape)[partner]
