@@ -122,14 +122,7 @@ def least_squares(disc: Discretization, nums: Numbers, fits: list[Any] | None = 
     whole = sorted_classes(disc, nums.ids, Stencils(table(disc), None))
     classes = [piece for cls in whole for piece in pieces(disc, nums, cls)]
     parts, loads = zip(*each("local fits", lambda cls: _normal_part(disc, nums, cls, shared, fits), classes))
-    if is_traced(loads):
-        b: Any = jnp.zeros(n)
-        for place, right in loads:
-            b = b.at[jnp.maximum(place, 0)].add(jnp.where(place >= 0, right, 0.0))
-    else:
-        b = np.zeros(n)
-        for place, right in loads:
-            np.add.at(b, place[place >= 0], right[place >= 0])
+    b = _added_up(*zip(*loads), np.zeros(n))
     return *_joined(parts), b
 
 
@@ -140,27 +133,55 @@ def _normal_part(disc: Discretization, nums: Numbers, cls: Class, shared: Any, f
         cls.scheme, disc.points, disc.kernel, cls.ids, cls.neighbours, given, right_sides(disc, nums, cls)
     )
     near = disc.images.owners(cls.neighbours)
-    xp = jnp if is_traced(near, made, nums.held, nums.gamma) else np
-    index = xp.maximum(near, 0)
-    place = xp.where((near >= 0)[..., None], xp.asarray(disc.unknowns)[index], -1).reshape(len(cls.ids), -1)
-    known = xp.where((near >= 0)[..., None], xp.asarray(nums.held)[index], 0.0).reshape(len(cls.ids), -1)
-    known = xp.where(place >= 0, 0.0, known)
-    extra = xp.asarray(nums.gamma)[index].reshape(len(cls.ids), -1)
-    m = place.shape[1]
-    matrix, load = xp.asarray(made.matrix), xp.asarray(made.load)
-    if fits is not None and xp is np:
+    host: Any = jnp if is_traced(near) else np
+    place = host.where((near >= 0)[..., None], host.asarray(disc.unknowns)[host.maximum(near, 0)], -1)
+    place = place.reshape(len(cls.ids), -1)
+    if fits is not None and not is_traced(near, made, nums.held, nums.gamma):
         own = slice(0, disc.rec.fields)
+        matrix, load = np.asarray(made.matrix), np.asarray(made.load)
+        extra = np.asarray(nums.gamma)[np.maximum(near, 0)].reshape(len(cls.ids), -1)
         fits.append((near, matrix[:, own].copy(), load[:, own].copy(), extra))
-    right = (load - xp.einsum("nij,nj->ni", matrix, xp.concatenate([known, extra], axis=1)))[:, :m]
-    r = xp.broadcast_to(place[:, :, None], (len(cls.ids), m, m))
-    c = xp.broadcast_to(place[:, None, :], (len(cls.ids), m, m))
+    right = _normal_load(made.matrix, made.load, near, place, nums.held, nums.gamma)
+    m = place.shape[1]
+    r = host.broadcast_to(place[:, :, None], (len(cls.ids), m, m))
+    c = host.broadcast_to(place[:, None, :], (len(cls.ids), m, m))
     keep = (r >= 0) & (c >= 0)
-    matrix = matrix[:, :m, :m]
     if is_traced(near):
+        matrix = made.matrix[:, :m, :m]
         entries = (jnp.where(keep, matrix, 0.0), jnp.where(keep, r, 0), jnp.where(keep, c, 0))
         return tuple(x.reshape(-1) for x in entries), (place, right)
-    at = np.nonzero(np.asarray(keep))
-    return (matrix[at], np.asarray(r)[at], np.asarray(c)[at]), (place, right)
+    at = np.nonzero(keep)
+    return (_block_entries(made.matrix, at), r[at], c[at]), (place, right)
+
+
+@in_one_program
+def _normal_load(matrix: Any, load: Any, near: Any, place: Any, held: Any, gamma: Any) -> Any:
+    """What is left of a block's right-hand side (n, m) once the known values are taken to it."""
+    xp = jnp if is_traced(matrix, load, near, held, gamma) else np
+    index, n = xp.maximum(near, 0), near.shape[0]
+    known = xp.where((near >= 0)[..., None], xp.asarray(held)[index], 0.0).reshape(n, -1)
+    known = xp.where(place >= 0, 0.0, known)
+    data = xp.concatenate([known, xp.asarray(gamma)[index].reshape(n, -1)], axis=1)
+    return (xp.asarray(load) - xp.einsum("nij,nj->ni", xp.asarray(matrix), data))[:, : place.shape[1]]
+
+
+@in_one_program
+def _block_entries(matrix: Any, at: tuple[np.ndarray, ...]) -> Any:
+    return (matrix if is_traced(matrix) else np.asarray(matrix))[at]
+
+
+@in_one_program
+def _added_up(places: Sequence[Any], loads: Sequence[Any], start: np.ndarray) -> Any:
+    """The right-hand side of the normal equations: the loads of all blocks at their places."""
+    if is_traced(places, loads):
+        b: Any = jnp.asarray(start)
+        for place, right in zip(places, loads):
+            b = b.at[jnp.maximum(place, 0)].add(jnp.where(place >= 0, right, 0.0))
+        return b
+    b = start.copy()
+    for place, right in zip(places, loads):
+        np.add.at(b, place[place >= 0], right[place >= 0])
+    return b
 
 
 def prefers_least_squares(disc: Discretization, nums: Numbers) -> bool:
