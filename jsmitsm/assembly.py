@@ -7,7 +7,7 @@ is fixed by the stencils and known before.
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import wraps
+from functools import partial, wraps
 from typing import Any, NamedTuple
 
 import jax
@@ -19,6 +19,7 @@ from jsmitsm.boundary import is_traced
 from jsmitsm.closure import Recovery
 from jsmitsm.kernels import Kernel
 from jsmitsm.moments import Block, Elimination, Row, Scheme, Support
+from jsmitsm.program import in_one_program
 from jsmitsm.recursion import row_lifts
 
 # Particles per block: larger blocks leave the cache and are several times slower; in one of a power of two, rows of
@@ -77,6 +78,22 @@ def _pad(x: Any, n: int, size: int) -> Any:
     return xp.concatenate([x, xp.broadcast_to(x[:1], (size - n, *x.shape[1:]))])
 
 
+def _widened(tree: Any, n: int, size: int) -> Any:
+    """Every array of n particles padded to ``size``; those that are not traced stay on the host."""
+    return tree if n == size else _all_padded(tree, n, size)
+
+
+@partial(in_one_program, static=("n", "size"))
+def _all_padded(tree: Any, n: int, size: int) -> Any:
+    return jax.tree.map(lambda x: _pad(x, n, size), tree)
+
+
+@partial(in_one_program, static=("m",))
+def _cut(tree: Any, m: int) -> Any:
+    """The first m particles. On the host where nothing is traced: an eager slice would compile for every length."""
+    return jax.tree.map(lambda x: (x if isinstance(x, jax.core.Tracer) else np.asarray(x))[:m], tree)
+
+
 def _in_size_classes(function: Any) -> Any:
     """Compile ``function(scheme, points, kernel, ids, neighbours, operands, each, whole)``, and call it
     with every particle axis padded: that of ``ids``, and that of the cloud."""
@@ -87,20 +104,17 @@ def _in_size_classes(function: Any) -> Any:
     def padded(scheme, points, kernel, ids, neighbours, operands, each=(), whole=()):
         n, m = points.shape[0], ids.shape[0]
         big, size = padded_size(n), padded_size(m)
-        cloud_wide = lambda tree: jax.tree.map(lambda x: _pad(x, n, big), tree)  # noqa: E731
-        class_wide = lambda tree: jax.tree.map(lambda x: _pad(x, m, size), tree)  # noqa: E731
-        jac = operands.jac if operands.jac.shape[0] == 1 else class_wide(operands.jac)
-        given = Operands(jac, class_wide(operands.own), cloud_wide(operands.data), operands.shared, operands.lengths)
-        arguments = (
-            cloud_wide(points), cloud_wide(kernel), class_wide(ids), class_wide(neighbours), given,
-            class_wide(each), cloud_wide(whole),
-        )  # fmt: skip
+        jac, one_for_all = operands.jac, operands.jac.shape[0] == 1
+        points, kernel, data, whole = _widened((points, kernel, operands.data, whole), n, big)
+        ids, neighbours, jac, own, each = _widened(
+            (ids, neighbours, None if one_for_all else jac, operands.own, each), m, size
+        )
+        given = Operands(operands.jac if one_for_all else jac, own, data, operands.shared, operands.lengths)
+        arguments = points, kernel, ids, neighbours, given, each, whole
         run = program
         if jax.default_backend() == "cpu" and not _inside(arguments):
             run = next(some for most, some in on_cpu if size <= most)
-        made = run(scheme, *arguments)
-        # Cut on the host where nothing is traced: an eager slice would compile for every length.
-        return jax.tree.map(lambda x: (x if isinstance(x, jax.core.Tracer) else np.asarray(x))[:m], made)
+        return _cut(run(scheme, *arguments), m)
 
     return padded
 

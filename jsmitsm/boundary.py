@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import jax
@@ -13,6 +14,7 @@ import numpy as np
 
 from jsmitsm.clouds import INTERIOR, Cloud
 from jsmitsm.problem import Condition, Problem
+from jsmitsm.program import in_one_program, picked
 from jsmitsm.recursion import Slot
 from jsmitsm.trace import Traced, trace
 
@@ -182,7 +184,7 @@ def _laid_out(problem, cloud, name, ids, conditions: list[Condition], order: int
     if len(ids) and (ids.min() < 0 or ids.max() >= len(cloud)):
         raise ValueError(f"bcs[{name!r}]: particle {int(ids.max())} does not exist; the cloud has {len(cloud)}")
     group = Group(name, ids)
-    points = cloud.points[ids]
+    points = picked(cloud.points, ids)
     for c in conditions:
         where = f"bcs[{name!r}]"
         if c.kind in ("dirichlet", "fix"):
@@ -225,7 +227,7 @@ def _held_by_residual(group: Group, problem: Problem) -> None:
 def _normals(cloud: Cloud, ids: np.ndarray, where: str) -> Any:
     if cloud.normals is None:
         raise ValueError(f"{where}: the condition uses the normal, but the cloud has none; give Cloud(..., normals=)")
-    normals = cloud.normals[ids]
+    normals = picked(cloud.normals, ids)
     if not is_traced(normals) and np.isnan(np.asarray(normals)).any():
         raise ValueError(f"{where}: NaN normals in this group; give every boundary particle a unit outward normal")
     return normals
@@ -316,20 +318,29 @@ def _parts(problem: Problem, points: Any, normals: Any, c: Condition, where: str
         if c.kind == "neumann":
 
             def numbers(_, get=get):
-                value = get("value")
-                return normals[:, None, :], value[:, None]
+                return normals[:, None, :], _as_column(get("value"))
 
             slots: tuple[Slot, ...] = tuple((k, b) for b in unit)
         else:
 
             def numbers(_, get=get):
-                a, b, value = get("a"), get("b"), get("value")
-                xp = jnp if is_traced(a, b, value, normals) or isinstance(a, jax.Array) else np
-                return xp.concatenate([a[:, None], b[:, None] * normals], axis=1)[:, None, :], value[:, None]
+                return _robin_rows(get("a"), get("b"), normals), _as_column(get("value"))
 
             slots = ((k, zero), *((k, b) for b in unit))
         parts.append(Part(slots, 1, True, numbers))
     return parts
+
+
+@in_one_program
+def _robin_rows(a: Any, b: Any, normals: Any) -> Any:
+    """The coefficients (n, 1, 1 + D) of a u + b n . grad u."""
+    xp = jnp if is_traced(a, b, normals) or isinstance(a, jax.Array) else np
+    return xp.concatenate([a[:, None], b[:, None] * normals], axis=1)[:, None, :]
+
+
+@in_one_program
+def _as_column(values: Any) -> Any:
+    return values[:, None]
 
 
 def _general(problem: Problem, points: Any, normals: Any, c: Condition, where: str) -> Part:
@@ -361,13 +372,19 @@ def merged(group: Group, slots: tuple[Slot, ...], derivatives: Any = None) -> tu
 
     derivatives (S, n): those of the iterate in ``slots``, for nonlinear conditions.
     """
-    coefs, values = [], []
+    coefs, values, places = [], [], []
     for part in group.parts:
         place = np.array([slots.index(s) for s in part.slots])
         coef, value = part.numbers(None if derivatives is None else derivatives[place])
-        spread = np.zeros((len(place), len(slots)))
-        spread[np.arange(len(place)), place] = 1.0
-        coefs.append(coef @ spread)
+        coefs.append(coef)
         values.append(value)
+        places.append(place)
+    return _spread(coefs, values, places, len(slots))
+
+
+@partial(in_one_program, static=("n_slots",))
+def _spread(coefs: list[Any], values: list[Any], places: list[np.ndarray], n_slots: int) -> tuple[Any, Any]:
+    """Functionals one below the other, each coefficient at the place of its slot."""
+    spread = [coef @ (place[:, None] == np.arange(n_slots)).astype(coef.dtype) for coef, place in zip(coefs, places)]
     xp = jnp if is_traced(coefs, values) or any(isinstance(v, jax.Array) for v in coefs + values) else np
-    return xp.concatenate(coefs, axis=1), xp.concatenate(values, axis=1)
+    return xp.concatenate(spread, axis=1), xp.concatenate(values, axis=1)

@@ -14,6 +14,7 @@ from jsmitsm.layout import Class, Discretization, sorted_classes, table
 from jsmitsm.moments import Row
 from jsmitsm.neighbours import Stencils
 from jsmitsm.numbers import Numbers
+from jsmitsm.program import in_one_program
 from jsmitsm.progress import each
 from jsmitsm.recursion import Recursion
 from jsmitsm.rows import operands, pieces, right_sides, shared_elimination
@@ -23,6 +24,7 @@ def matrix(disc: Discretization, classes: list[Class], rows: list[Row]) -> tuple
     """The global matrix as coordinates: own u_i - sum_g weights u_g over the unknowns."""
     unknown, fields = disc.unknowns, disc.rec.fields
     parts: list[Any] = []
+    places: list[Any] = []
     for cls, row in zip(classes, rows):
         near = disc.images.owners(cls.neighbours)
         xp: Any = jnp if is_traced(near) else np
@@ -42,13 +44,21 @@ def matrix(disc: Discretization, classes: list[Class], rows: list[Row]) -> tuple
                 )
             )
         else:
-            place = np.flatnonzero(keep)
-            weights = row.weights.reshape(-1) if is_traced(row.weights) else np.asarray(row.weights).reshape(-1)
-            parts.append((-weights[place], r.reshape(-1)[place], c.reshape(-1)[place]))
-    n = int(unknown.max(initial=-1)) + 1
-    if disc.scheme.method != "SSPH":
-        parts.append((np.ones(n), np.arange(n), np.arange(n)))
-    return _joined(parts)
+            places.append(np.flatnonzero(keep))
+            parts.append((row.weights, *(x.reshape(-1)[places[-1]] for x in (r, c))))
+    n = int(unknown.max(initial=-1)) + 1 if disc.scheme.method != "SSPH" else 0
+    ones, every = np.ones(n), np.arange(n)
+    if not places:
+        return _joined([*parts, (ones, every, every)])
+    weights, at, to = zip(*parts)
+    return _entries(weights, places, ones), np.concatenate([*at, every]), np.concatenate([*to, every])
+
+
+@in_one_program
+def _entries(weights: Sequence[Any], places: Sequence[np.ndarray], diagonal: np.ndarray) -> Any:
+    """The entries of the matrix: the weights at their places, negative, and the diagonal of ones."""
+    xp = jnp if is_traced(weights) else np
+    return xp.concatenate([*(-xp.asarray(w).reshape(-1)[at] for w, at in zip(weights, places)), diagonal])
 
 
 def _joined(parts: Sequence[tuple[Any, Any, Any]]) -> tuple[Any, Any, Any]:
@@ -64,22 +74,30 @@ def right_side(disc: Discretization, nums: Numbers, classes: list[Class], rows: 
     unknown = disc.unknowns
     parts, places = [], []
     for cls, row in zip(classes, rows):
-        xp = jnp if is_traced(nums.source, nums.given, nums.held, nums.gamma, row, cls.neighbours) else np
         source, given = right_sides(disc, nums, cls)
-        w, v, v_own = (xp.asarray(x) for x in (row.weights, row.source, row.condition))
-        index = xp.maximum(disc.images.owners(cls.neighbours), 0)
-        total = xp.einsum("nfk,nk->nf", v_own, given) + row.constant
-        if cls.scheme.sourced:
-            total = total + xp.einsum("nfr,nr->nf", v, source)
-        total = total + xp.einsum("nfgh,ngh->nf", w, xp.asarray(nums.held)[index])
-        if disc.scheme.n_data:
-            total = total + xp.einsum("nfgd,ngd->nf", xp.asarray(row.data), xp.asarray(nums.gamma)[index])
+        near = disc.images.owners(cls.neighbours)
         own = unknown[cls.ids]
-        parts.append(total.reshape(-1)[np.flatnonzero(own >= 0)])
+        parts.append((row, source if cls.scheme.sourced else None, given, near, np.flatnonzero(own >= 0)))
         places.append(own[own >= 0])
-    xp = jnp if is_traced(parts) else np
-    order = np.argsort(np.concatenate(places)) if places else np.zeros(0, int)
-    return xp.concatenate(parts)[order] if parts else np.zeros(0)
+    return _loads(parts, nums.held, nums.gamma, np.argsort(np.concatenate(places))) if parts else np.zeros(0)
+
+
+@in_one_program
+def _loads(parts: Sequence[Any], held: Any, gamma: Any, order: np.ndarray) -> Any:
+    """The right-hand side from every class's row, source, own conditions, neighbours and places."""
+    xp = jnp if is_traced(parts, held, gamma) else np
+    found = []
+    for row, source, given, near, free in parts:
+        w, v, v_own, data = (xp.asarray(x) for x in (row.weights, row.source, row.condition, row.data))
+        index = xp.maximum(near, 0)
+        total = xp.einsum("nfk,nk->nf", v_own, given) + row.constant
+        if source is not None:
+            total = total + xp.einsum("nfr,nr->nf", v, source)
+        total = total + xp.einsum("nfgh,ngh->nf", w, xp.asarray(held)[index])
+        if gamma.shape[1]:
+            total = total + xp.einsum("nfgd,ngd->nf", data, xp.asarray(gamma)[index])
+        found.append(total.reshape(-1)[free])
+    return xp.concatenate(found)[order]
 
 
 def misfit(disc: Discretization, nums: Numbers, fits: list[Any], values: Any) -> np.ndarray:
@@ -104,14 +122,7 @@ def least_squares(disc: Discretization, nums: Numbers, fits: list[Any] | None = 
     whole = sorted_classes(disc, nums.ids, Stencils(table(disc), None))
     classes = [piece for cls in whole for piece in pieces(disc, nums, cls)]
     parts, loads = zip(*each("local fits", lambda cls: _normal_part(disc, nums, cls, shared, fits), classes))
-    if is_traced(loads):
-        b: Any = jnp.zeros(n)
-        for place, right in loads:
-            b = b.at[jnp.maximum(place, 0)].add(jnp.where(place >= 0, right, 0.0))
-    else:
-        b = np.zeros(n)
-        for place, right in loads:
-            np.add.at(b, place[place >= 0], right[place >= 0])
+    b = _added_up(*zip(*loads), np.zeros(n))
     return *_joined(parts), b
 
 
@@ -122,27 +133,55 @@ def _normal_part(disc: Discretization, nums: Numbers, cls: Class, shared: Any, f
         cls.scheme, disc.points, disc.kernel, cls.ids, cls.neighbours, given, right_sides(disc, nums, cls)
     )
     near = disc.images.owners(cls.neighbours)
-    xp = jnp if is_traced(near, made, nums.held, nums.gamma) else np
-    index = xp.maximum(near, 0)
-    place = xp.where((near >= 0)[..., None], xp.asarray(disc.unknowns)[index], -1).reshape(len(cls.ids), -1)
-    known = xp.where((near >= 0)[..., None], xp.asarray(nums.held)[index], 0.0).reshape(len(cls.ids), -1)
-    known = xp.where(place >= 0, 0.0, known)
-    extra = xp.asarray(nums.gamma)[index].reshape(len(cls.ids), -1)
-    m = place.shape[1]
-    matrix, load = xp.asarray(made.matrix), xp.asarray(made.load)
-    if fits is not None and xp is np:
+    host: Any = jnp if is_traced(near) else np
+    place = host.where((near >= 0)[..., None], host.asarray(disc.unknowns)[host.maximum(near, 0)], -1)
+    place = place.reshape(len(cls.ids), -1)
+    if fits is not None and not is_traced(near, made, nums.held, nums.gamma):
         own = slice(0, disc.rec.fields)
+        matrix, load = np.asarray(made.matrix), np.asarray(made.load)
+        extra = np.asarray(nums.gamma)[np.maximum(near, 0)].reshape(len(cls.ids), -1)
         fits.append((near, matrix[:, own].copy(), load[:, own].copy(), extra))
-    right = (load - xp.einsum("nij,nj->ni", matrix, xp.concatenate([known, extra], axis=1)))[:, :m]
-    r = xp.broadcast_to(place[:, :, None], (len(cls.ids), m, m))
-    c = xp.broadcast_to(place[:, None, :], (len(cls.ids), m, m))
+    right = _normal_load(made.matrix, made.load, near, place, nums.held, nums.gamma)
+    m = place.shape[1]
+    r = host.broadcast_to(place[:, :, None], (len(cls.ids), m, m))
+    c = host.broadcast_to(place[:, None, :], (len(cls.ids), m, m))
     keep = (r >= 0) & (c >= 0)
-    matrix = matrix[:, :m, :m]
     if is_traced(near):
+        matrix = made.matrix[:, :m, :m]
         entries = (jnp.where(keep, matrix, 0.0), jnp.where(keep, r, 0), jnp.where(keep, c, 0))
         return tuple(x.reshape(-1) for x in entries), (place, right)
-    at = np.nonzero(np.asarray(keep))
-    return (matrix[at], np.asarray(r)[at], np.asarray(c)[at]), (place, right)
+    at = np.nonzero(keep)
+    return (_block_entries(made.matrix, at), r[at], c[at]), (place, right)
+
+
+@in_one_program
+def _normal_load(matrix: Any, load: Any, near: Any, place: Any, held: Any, gamma: Any) -> Any:
+    """What is left of a block's right-hand side (n, m) once the known values are taken to it."""
+    xp = jnp if is_traced(matrix, load, near, held, gamma) else np
+    index, n = xp.maximum(near, 0), near.shape[0]
+    known = xp.where((near >= 0)[..., None], xp.asarray(held)[index], 0.0).reshape(n, -1)
+    known = xp.where(place >= 0, 0.0, known)
+    data = xp.concatenate([known, xp.asarray(gamma)[index].reshape(n, -1)], axis=1)
+    return (xp.asarray(load) - xp.einsum("nij,nj->ni", xp.asarray(matrix), data))[:, : place.shape[1]]
+
+
+@in_one_program
+def _block_entries(matrix: Any, at: tuple[np.ndarray, ...]) -> Any:
+    return (matrix if is_traced(matrix) else np.asarray(matrix))[at]
+
+
+@in_one_program
+def _added_up(places: Sequence[Any], loads: Sequence[Any], start: np.ndarray) -> Any:
+    """The right-hand side of the normal equations: the loads of all blocks at their places."""
+    if is_traced(places, loads):
+        b: Any = jnp.asarray(start)
+        for place, right in zip(places, loads):
+            b = b.at[jnp.maximum(place, 0)].add(jnp.where(place >= 0, right, 0.0))
+        return b
+    b = start.copy()
+    for place, right in zip(places, loads):
+        np.add.at(b, place[place >= 0], right[place >= 0])
+    return b
 
 
 def prefers_least_squares(disc: Discretization, nums: Numbers) -> bool:
@@ -152,6 +191,7 @@ def prefers_least_squares(disc: Discretization, nums: Numbers) -> bool:
     There a value predicted by neighbours on all sides is the wrong global form.
     """
     rec, jac = disc.rec, concrete(nums.jac)
+    jac = None if jac is None else np.asarray(jac)  # where it only carries derivatives, no operation is recorded
     orders = {rec.order - q for q in rec.degrees}
     if disc.scheme.method != "S" or rec.fields > 1:
         return False
@@ -225,9 +265,16 @@ def wave_number(disc: Discretization, nums: Numbers) -> float:
 
 def with_held(disc: Discretization, nums: Numbers, x: Any) -> Any:
     """All values (N, F) from the unknowns x (n,)."""
-    place = np.flatnonzero(~disc.held.reshape(-1))
-    if is_traced(x, nums.held):
-        return jnp.asarray(nums.held).reshape(-1).at[place].set(x).reshape(disc.held.shape)[disc.partner]
-    values = np.array(nums.held).reshape(-1)
-    values[place] = x
-    return values.reshape(disc.held.shape)[disc.partner]
+    return _inserted(nums.held, np.flatnonzero(~disc.held.reshape(-1)), x, disc.partner)
+
+
+@in_one_program
+def _inserted(held: Any, place: np.ndarray, x: Any, partner: np.ndarray) -> Any:
+    """The unknowns x put at their places among all values, and every value taken from its partner."""
+    values: Any
+    if is_traced(held, x):
+        values = jnp.asarray(held).reshape(-1).at[place].set(x)
+    else:
+        values = np.array(held).reshape(-1)
+        values[place] = x
+    return values.reshape(held.shape)[partner]

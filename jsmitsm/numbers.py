@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm.boundary import is_traced, merged
 from jsmitsm.layout import Discretization, closed
 from jsmitsm.problem import Problem
+from jsmitsm.program import in_one_program, picked
 from jsmitsm.recursion import Recursion, Slot, source_rows
 from jsmitsm.series import Ring, mul
 from jsmitsm.taylor import factorial, index_of, multi_indices
@@ -47,15 +50,12 @@ def numbers(disc: Discretization, problem: Problem, taylor: Any = None, everywhe
     """
     everywhere = everywhere or disc.scheme.method in ("I", "II")  # neighbours recover derivatives too
     ids = np.arange(len(disc.cloud)) if everywhere else disc.active
-    here = None if taylor is None else taylor[ids]
-    jac, source = operator_numbers(disc, problem, disc.cloud.points[ids], here)
-    held = np.zeros(disc.held.shape)
-    for group in disc.groups:
-        for k, value in group.held.items():
-            held = _set(held, (group.ids, k), value())
+    here = None if taylor is None else picked(taylor, ids)
+    jac, source = operator_numbers(disc, problem, picked(disc.cloud.points, ids), here)
+    held = [((group.ids, k), value()) for group in disc.groups for k, value in group.held.items()]
     own_ids, own, given = _own_numbers(disc, taylor)
     data, gamma = _data_numbers(disc, taylor)
-    return Numbers(ids, jac, source, own_ids, own, given, held, data, gamma)
+    return Numbers(ids, jac, source, own_ids, own, given, _filled(np.zeros(disc.held.shape), held), data, gamma)
 
 
 def operator_numbers(disc: Discretization, problem: Problem, points: Any, taylor: Any) -> tuple[Any, Any]:
@@ -70,13 +70,20 @@ def operator_numbers(disc: Discretization, problem: Problem, points: Any, taylor
         # The residual linearised about the local expansion U: R(U) + R'(U) (u - U) = 0.
         at = slot_series(rec, traced.slots, taylor, rec.degree)
         jac, res = traced.coefficients(points, rec.degree, params=problem.params, slots=at)
-        ring = Ring(rec.dim, rec.degree)
-        for e in range(jac.shape[0]):
-            change = sum(mul(ring, jac[e, s], at[s]) for s in range(len(traced.slots)) if rec.pattern[e][s])
-            res = _set(res, e, res[e] - change)
+        res = _moved(rec, jac, res, at)
     if traced.linear:
         _refuse_nonfinite(points, jac, res)
     return jac, source_rows(rec, res)
+
+
+@partial(in_one_program, static=("rec",))
+def _moved(rec: Recursion, jac: Any, res: Any, at: Any) -> Any:
+    """R(U) - R'(U) U: the residual (E, T, n) of a linearised operator at u = 0."""
+    ring = Ring(rec.dim, rec.degree)
+    for e in range(jac.shape[0]):
+        change = sum(mul(ring, jac[e, s], at[s]) for s in range(len(rec.slots)) if rec.pattern[e][s])
+        res = _filled(res, [(e, res[e] - change)])
+    return res
 
 
 def _refuse_nonfinite(points: Any, *series: Any) -> None:
@@ -98,6 +105,11 @@ def _refuse_nonfinite(points: Any, *series: Any) -> None:
 
 def slot_series(rec: Recursion, slots: tuple[Slot, ...], taylor: Any, degree: int) -> Any:
     """Taylor coefficients (S, T, n) of the slots' derivatives from local expansions (n, F, K)."""
+    return _derivatives(taylor, rec, slots, degree)
+
+
+@partial(in_one_program, static=("rec", "slots", "degree"))
+def _derivatives(taylor: Any, rec: Recursion, slots: tuple[Slot, ...], degree: int) -> Any:
     place = index_of(rec.dim, rec.order)
     out = []
     for f, b in slots:
@@ -120,36 +132,47 @@ def _own_numbers(disc: Discretization, taylor: Any) -> tuple[np.ndarray, Any, An
     slots, zero = disc.scheme.own, (0,) * disc.rec.dim
     ids = np.flatnonzero(disc.n_own)
     most = int(disc.n_own.max(initial=0))
-    own, given = np.zeros((len(ids), most, len(slots))), np.zeros((len(ids), most))
+    own: list[Any] = []
+    given: list[Any] = []
     for group in disc.groups:
         at = np.searchsorted(ids, group.ids)
         for row, (k, value) in enumerate(group.held.items()):
-            own[at, row, slots.index((k, zero))] = 1.0
-            given = _set(given, (at, row), value())
-    for group in disc.groups:
+            own.append(((at, row, slots.index((k, zero))), 1.0))
+            given.append(((at, row), value()))
         if group.parts:
-            at = np.searchsorted(ids, group.ids)
             coef, value = merged(group, slots, _slot_values(slots, disc.rec, taylor, group.ids))
             index = (at[:, None], (len(group.held) + np.arange(coef.shape[1]))[None, :])
-            own, given = _set(own, index, coef), _set(given, index, value)
-    return ids, own, given
+            own.append((index, coef))
+            given.append((index, value))
+    return ids, _filled(np.zeros((len(ids), most, len(slots))), own), _filled(np.zeros((len(ids), most)), given)
 
 
 def _data_numbers(disc: Discretization, taylor: Any) -> tuple[Any, Any]:
     """The conditions of particles whose values are all held, as data for their neighbours."""
     scheme, n = disc.scheme, len(disc.cloud)
-    data, gamma = np.zeros((n, scheme.n_data, len(scheme.data))), np.zeros((n, scheme.n_data))
+    data: list[Any] = []
+    gamma: list[Any] = []
     for group in disc.groups:
         if closed(group, disc.rec):
             coef, value = merged(group, scheme.data, _slot_values(scheme.data, disc.rec, taylor, group.ids))
             index = (group.ids[:, None], np.arange(coef.shape[1])[None, :])
-            data, gamma = _set(data, index, coef), _set(gamma, index, value)
-    return data, gamma
+            data.append((index, coef))
+            gamma.append((index, value))
+    shape = (n, scheme.n_data)
+    return _filled(np.zeros((*shape, len(scheme.data))), data), _filled(np.zeros(shape), gamma)
 
 
-def _set(array: Any, index: Any, value: Any) -> Any:
-    """array[index] = value; in place where both are concrete."""
-    if isinstance(array, np.ndarray) and not is_traced(value, index):
-        array[index] = np.asarray(value)
+def _filled(array: Any, places: list[tuple[Any, Any]]) -> Any:
+    """array[index] = value for every pair of ``places``; in place where all are concrete."""
+    if isinstance(array, np.ndarray) and not is_traced(places):
+        for index, value in places:
+            array[index] = np.asarray(value)
         return array
-    return jnp.asarray(array).at[index].set(value)
+    return _set_each(array, places)
+
+
+@jax.jit
+def _set_each(array: Any, places: list[tuple[Any, Any]]) -> Any:
+    for index, value in places:
+        array = array.at[index].set(value)
+    return array

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable
+from functools import wraps
 from typing import Any
 
 import jax
@@ -24,6 +25,25 @@ def kept(key: Any, make: Callable[[], Any]) -> Any:
             _programs.popitem(last=False)
     _programs.move_to_end(key)
     return _programs[key]
+
+
+def in_one_program(function: Callable[..., Any], static: tuple[str, ...] = ()) -> Callable[..., Any]:
+    """``function`` as it stands, for numbers; compiled as a whole where an argument of it is traced.
+
+    Under an eager jax.grad or jax.vmap each operation is otherwise a program of its own, compiled for every
+    shape, and so is what differentiates it: a hundred of them take ten times as long as the local phase.
+    """
+    program = jax.jit(function, static_argnames=static)
+
+    @wraps(function)
+    def run(*arguments: Any, **named: Any) -> Any:
+        traced = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((arguments, named)))
+        return (program if traced else function)(*arguments, **named)
+
+    return run
+
+
+picked = in_one_program(lambda values, index: values[index])
 
 
 def fingerprint(jaxpr: Any, rules: bool = True) -> Any:

@@ -25,6 +25,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jsmitsm.program import in_one_program
 from jsmitsm.smallsolve import general_inverse
 from jsmitsm.taylor import factorial, index_of, multi_indices
 
@@ -171,6 +172,11 @@ def source_rows(rec: Recursion, residual: Any) -> Any:
     taylor = index_of(rec.dim, rec.degree)
     e = np.array([e for e, _ in _rows(rec)])
     t = np.array([taylor[c] for _, c in _rows(rec)])
+    return _negative(residual, e, t)
+
+
+@in_one_program
+def _negative(residual: Any, e: np.ndarray, t: np.ndarray) -> Any:
     return -residual[e, t]
 
 

@@ -19,6 +19,7 @@ from jsmitsm.layout import Class, Discretization
 from jsmitsm.moments import Elimination, Row
 from jsmitsm.neighbours import nearest, within
 from jsmitsm.numbers import Numbers
+from jsmitsm.program import in_one_program
 from jsmitsm.progress import each, shown
 from jsmitsm.repeats import repeats
 from jsmitsm.threads import cores, side_by_side
@@ -33,17 +34,18 @@ def operands(disc: Discretization, nums: Numbers, cls: Class, shared: Eliminatio
     """What the particles of a class need; the particle axis first."""
     ids, scheme, jac, lengths = cls.ids, cls.scheme, nums.jac, None
     if jac.shape[-1] > 1:
-        jac = jac[..., np.searchsorted(nums.ids, ids)]
+        jac = _particles_first(jac, np.searchsorted(nums.ids, ids), len(ids))
     elif shared is not None:
         jac = np.zeros((1, 1, 1, 1))
     else:
         some = _eliminations(disc, nums, cls)
-        if some is not None:
+        if some is None:
+            jac = _particles_first(jac, None, 1)
+        else:
             shared, lengths, jac = some
     own = np.zeros((len(ids), 0, len(scheme.own)))
     if scheme.n_own:
-        own = nums.own[np.searchsorted(nums.own_ids, ids), : scheme.n_own]
-    jac = (jnp if is_traced(jac) else np).moveaxis(jac, -1, 0)
+        own = _first_columns(nums.own, np.searchsorted(nums.own_ids, ids), scheme.n_own)
     return Operands(jac, own, disc.images.extend_values(nums.data), shared, lengths)
 
 
@@ -249,15 +251,26 @@ def class_coefficients(disc: Discretization, nums: Numbers, cls: Class, shared: 
 
 def right_sides(disc: Discretization, nums: Numbers, cls: Class) -> tuple[Any, Any]:
     """The recursion's right-hand side (n, rows) and the own conditions' values (n, n_own)."""
-    n = len(cls.ids)
-    xp = jnp if is_traced(nums.source) else np
-    source = nums.source
-    if source.shape[1] > 1:
-        source = source[:, np.searchsorted(nums.ids, cls.ids)]
-    source = xp.broadcast_to(source, (source.shape[0], n)).T
+    n, source = len(cls.ids), nums.source
+    here = np.searchsorted(nums.ids, cls.ids) if source.shape[1] > 1 else None
+    source = _particles_first(source, here, n)
     if not cls.scheme.n_own:
         return source, np.zeros((n, 0))
-    return source, nums.given[np.searchsorted(nums.own_ids, cls.ids), : cls.scheme.n_own]
+    return source, _first_columns(nums.given, np.searchsorted(nums.own_ids, cls.ids), cls.scheme.n_own)
+
+
+@partial(in_one_program, static=("n",))
+def _particles_first(values: Any, here: np.ndarray | None, n: int) -> Any:
+    """The n particles ``here`` of an array with the particle axis last, that axis first; None: one serves all."""
+    xp = jnp if is_traced(values) else np
+    values = xp.asarray(values)
+    chosen = xp.broadcast_to(values, (*values.shape[:-1], n)) if here is None else values[..., here]
+    return xp.moveaxis(chosen, -1, 0)
+
+
+@partial(in_one_program, static=("count",))
+def _first_columns(values: Any, here: np.ndarray, count: int) -> Any:
+    return values[here, :count]
 
 
 def all_coefficients(disc: Discretization, nums: Numbers, values: Any) -> Any:
@@ -265,9 +278,14 @@ def all_coefficients(disc: Discretization, nums: Numbers, values: Any) -> Any:
     shared = shared_elimination(disc, nums)
     parts = [class_coefficients(disc, nums, c, shared, values) for c in disc.classes]
     shape = (len(disc.cloud), disc.rec.fields, disc.rec.size)
-    ids = np.concatenate([c.ids for c in disc.classes])
+    return _scattered(parts, np.concatenate([c.ids for c in disc.classes]), disc.partner, shape)
+
+
+@partial(in_one_program, static=("shape",))
+def _scattered(parts: list[Any], ids: np.ndarray, partner: np.ndarray, shape: tuple[int, ...]) -> Any:
+    """The coefficients of all classes at their particles, and every particle's taken from its partner."""
     if is_traced(parts):
-        return jnp.zeros(shape).at[ids].set(jnp.concatenate(parts))[disc.partner]
+        return jnp.zeros(shape).at[ids].set(jnp.concatenate(parts))[partner]
     out = np.zeros(shape)
     out[ids] = np.concatenate([np.asarray(p) for p in parts])
-    return out[disc.partner]
+    return out[partner]
