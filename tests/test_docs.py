@@ -23,8 +23,9 @@ def no_windows():
 
 
 @pytest.mark.parametrize("page", sorted(p.name for p in DOCS.glob("*.md")))
-def test_blocks_of_a_page_run(page, capsys):
-    """Top to bottom in one namespace; the asserts in them are the test."""
+def test_blocks_of_a_page_run(page, capsys, tmp_path, monkeypatch):
+    """Top to bottom in one namespace, files in a directory of their own; the asserts in them are the test."""
+    monkeypatch.chdir(tmp_path)
     names: dict = {}
     for k, block in enumerate(re.findall(r"^```python\n(.*?)^```", (DOCS / page).read_text(), re.M | re.S)):
         exec(compile(block, f"{page}[{k}]", "exec"), names)
