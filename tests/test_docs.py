@@ -39,14 +39,8 @@ def test_examples_in_docstrings(name):
 
 
 def public():
-    """What ``import jsmitsm`` offers, by name, that is the package's own."""
-    names = {n for n in dir(jsmitsm) if not n.startswith("_")} | set(jsmitsm._LAZY_NAMES)
-    things = {name: getattr(jsmitsm, name) for name in sorted(names)}
-    return {
-        name: thing
-        for name, thing in things.items()
-        if callable(thing) and getattr(thing, "__module__", "").startswith("jsmitsm")
-    }
+    """The classes and functions that ``import jsmitsm`` offers, by name."""
+    return {name: getattr(jsmitsm, name) for name in jsmitsm.__all__ if callable(getattr(jsmitsm, name))}
 
 
 def test_every_public_name_is_documented_and_in_the_reference():
