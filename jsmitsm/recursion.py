@@ -26,9 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm.smallsolve import general_inverse
-from jsmitsm.taylor import factorial, index_of, multi_indices
-
-Slot = tuple[int, tuple[int, ...]]
+from jsmitsm.taylor import Slot, factorial, index_of, multi_indices
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,6 @@ from jsmitsm.boundary import is_traced
 from jsmitsm.clouds import Cloud
 from jsmitsm.errors import SolveError
 from jsmitsm.polynomials import derivative_table, monomials
-from jsmitsm.taylor import multi_indices
 
 # An estimated error above this part of the solution is a flag.
 LARGE = 0.1
@@ -313,8 +312,3 @@ def _evaluate(b, order, centres, taylor, points, near, weight):
         p = monomials(points - centres[near[:, k]], order)[:, lower] * factor
         total = total + weight[:, k, None] * jnp.einsum("mfk,mk->mf", taylor[near[:, k]], p)
     return total
-
-
-def size_of(dim: int, order: int) -> int:
-    """Taylor coefficients of one field."""
-    return len(multi_indices(dim, order))
