@@ -17,24 +17,37 @@ from jsmitsm.taylor import multi_indices
 
 __version__ = "0.1.0"
 
+__all__ = [
+    "Cloud", "Condition", "Constant", "CubicSpline", "Factorization", "Gaussian", "Kernel", "Problem", "Quality",
+    "Solution", "SolveError", "Stencils", "SuperGaussian", "TuneResult", "Wendland", "box", "condition", "continuation",
+    "dirichlet", "divergence", "factorize", "files", "fix", "free", "from_polygon", "from_sdf", "grad", "hessian",
+    "interval", "laplacian", "multi_indices", "neumann", "no_progress", "partial", "periodic", "plot", "quadrature",
+    "quality", "rectangle", "robin", "sdf", "show_versions", "solve", "stencils", "tune",
+]  # fmt: skip
+
 # Imported when first used: they need more than solving does.
-_LAZY = {"files": "jsmitsm.files", "plot": "jsmitsm.plot", "sdf": "jsmitsm.sdf"}
+_LAZY_MODULES = ("files", "plot", "sdf")
 _LAZY_NAMES = {
-    "Quality": "jsmitsm.evenness",
-    "TuneResult": "jsmitsm.tuning",
-    "continuation": "jsmitsm.stages",
-    "from_polygon": "jsmitsm.shapes",
-    "from_sdf": "jsmitsm.shapes",
-    "quadrature": "jsmitsm.boundary_quadrature",
-    "quality": "jsmitsm.evenness",
-    "show_versions": "jsmitsm.versions",
-    "tune": "jsmitsm.tuning",
+    "Quality": "evenness",
+    "TuneResult": "tuning",
+    "continuation": "stages",
+    "from_polygon": "shapes",
+    "from_sdf": "shapes",
+    "quadrature": "boundary_quadrature",
+    "quality": "evenness",
+    "show_versions": "versions",
+    "tune": "tuning",
 }
 
 
 def __getattr__(name: str) -> Any:
-    if name in _LAZY:
-        return import_module(_LAZY[name])
+    if name in _LAZY_MODULES:
+        return import_module(f"jsmitsm.{name}")
     if name in _LAZY_NAMES:
-        return getattr(import_module(_LAZY_NAMES[name]), name)
+        return getattr(import_module(f"jsmitsm.{_LAZY_NAMES[name]}"), name)
     raise AttributeError(f"module 'jsmitsm' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    """The public names, those that were not used yet too."""
+    return [*__all__, *(name for name in globals() if name.startswith("__"))]

@@ -15,7 +15,7 @@ import numpy as np
 from jsmitsm.clouds import INTERIOR, Cloud
 from jsmitsm.problem import Condition, Problem
 from jsmitsm.program import in_one_program, picked
-from jsmitsm.recursion import Slot
+from jsmitsm.taylor import Slot
 from jsmitsm.trace import Traced, trace
 
 
@@ -106,7 +106,7 @@ def group_conditions(problem: Problem, cloud: Cloud, order: int, orders: tuple[i
             raise ValueError(
                 f"bcs[{name!r}]: its particles take the values of their periodic partners; remove its other conditions"
             )
-    if not any(c.kind not in ("free",) for cs in given.values() for c in cs):
+    if not any(c.kind != "free" for cs in given.values() for c in cs):
         raise ValueError(f"bcs: no condition on any group ({names}), so the solution is not determined; give one")
     groups = []
     counts = {name: 0 for name in names if name not in used and len(cloud.groups[name])}
@@ -116,7 +116,7 @@ def group_conditions(problem: Problem, cloud: Cloud, order: int, orders: tuple[i
             raise ValueError(f"bcs: {name!r} is no group of the cloud; it has {names}")
         if name == INTERIOR and len(pinned) < len(conditions):
             raise ValueError('bcs: "interior" takes no boundary condition; hold single particles with js.fix')
-        groups += [_laid_out(problem, cloud, f"{name}", np.array(c.indices), [c], order, highest) for c in pinned]
+        groups += [_laid_out(problem, cloud, name, np.array(c.indices), [c], order, highest) for c in pinned]
         rest = [c for c in conditions if c.kind not in ("fix", "periodic", "free")]
         if rest:
             groups.append(_laid_out(problem, cloud, name, cloud.groups[name], rest, order, highest))

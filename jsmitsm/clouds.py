@@ -26,7 +26,6 @@ class Groups(Mapping[str, np.ndarray]):
             index.setflags(write=False)
             self._groups[name] = index
         self._key = tuple((name, index.tobytes()) for name, index in self._groups.items())
-        self._hash = hash(self._key)
 
     def __getitem__(self, name: str) -> np.ndarray:
         return self._groups[name]
@@ -38,7 +37,7 @@ class Groups(Mapping[str, np.ndarray]):
         return len(self._groups)
 
     def __hash__(self) -> int:
-        return self._hash
+        return hash(self._key)
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Groups) and self._key == other._key

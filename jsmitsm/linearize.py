@@ -13,7 +13,8 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
 from jsmitsm.elementwise import ELEMENTWISE
 from jsmitsm.jaxprs import EVERYTHING, bind, called, levels, literal
-from jsmitsm.operators import Field, LocalField, Slot, field_p, frozen_p
+from jsmitsm.operators import Field, LocalField, field_p, frozen_p
+from jsmitsm.taylor import Slot
 
 # What a value of the traced residual is to the point: the point itself, dependent on it, or not.
 POINT, DEPENDENT, FREE = 2, 1, 0

@@ -223,7 +223,8 @@ def within(points: np.ndarray, radius: Any, which: np.ndarray | None = None) -> 
     except (TypeError, ValueError):
         raise ValueError(f"radius: expected a positive scalar or ({len(centres)},) array, got {radius!r}") from None
     if radius.shape not in ((), (len(centres),)) or not (np.isfinite(radius) & (radius > 0)).all():
-        raise ValueError(f"radius: expected a positive scalar or ({len(centres)},) array, got shape {radius.shape}")
+        came = f"shape {radius.shape}" if radius.ndim else f"{radius}"
+        raise ValueError(f"radius: expected positive numbers, a scalar or ({len(centres)},), got {came}")
     return _ragged(_tree(points), centres, np.broadcast_to(radius * EDGE, (len(centres),)), which)
 
 

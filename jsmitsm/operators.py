@@ -14,9 +14,7 @@ import numpy as np
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching
 
-from jsmitsm.taylor import MultiIndex, add
-
-Slot = tuple[int, MultiIndex]
+from jsmitsm.taylor import MultiIndex, Slot, add
 
 # d^a u_k at a point.  Its derivative is the next higher derivative, which is all that
 # jax.grad, jax.jacfwd and the operators below need to know about an unknown field.
@@ -108,7 +106,9 @@ class Field:
     Raises ``ValueError`` for a point that is not of shape (D,).
 
     >>> import jsmitsm as js
-    >>> js.Problem(lambda u, x: js.laplacian(u)(x) - u(x), {"left": js.dirichlet(0.0)})  # doctest: +SKIP
+    >>> u = local_field(2)
+    >>> sorted(index for _, index in (js.laplacian(u) - 2.0 * u).terms)
+    [(0, 0), (0, 2), (2, 0)]
     """
 
     __slots__ = ("dim", "terms")

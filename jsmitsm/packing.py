@@ -311,8 +311,7 @@ def near_pairs(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Distances and indices (M, k) of as many neighbours as :func:`thin` can need, itself first."""
     from scipy.spatial import cKDTree
 
-    gap, other = cKDTree(points).query(points, k=range(1, min(48, len(points)) + 1))
-    return gap, other
+    return cKDTree(points).query(points, k=range(1, min(48, len(points)) + 1))
 
 
 def thin(

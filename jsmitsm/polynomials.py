@@ -9,26 +9,26 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from jsmitsm.recursion import Recursion, Slot
-from jsmitsm.taylor import factorial, index_of, multi_indices
+from jsmitsm.recursion import Recursion
+from jsmitsm.taylor import Slot, factorial, index_of, multi_indices
 
 
 @lru_cache(maxsize=32)
-def _monomial_steps(dim: int, order: int) -> list[tuple[int, int, int]]:
-    """Blocks (source prefix, axis, how many) that build each degree from the one before."""
-    indices, place = multi_indices(dim, order), index_of(dim, order)
+def _monomial_steps(dim: int, order: int) -> list[tuple[int, int]]:
+    """For each monomial but the first: the place of one a degree lower, and the axis to multiply it with."""
+    place = index_of(dim, order)
     steps = []
-    for k, a in enumerate(indices[1:], start=1):
+    for a in multi_indices(dim, order)[1:]:
         axis = next(j for j in range(dim) if a[j])
         lower = tuple(v - (j == axis) for j, v in enumerate(a))
-        steps.append((k, place[lower], axis))
+        steps.append((place[lower], axis))
     return steps
 
 
 def monomials(offset: Any, order: int) -> Any:
     """All monomials s^a with |a| <= order: (ns, D) -> (ns, K)."""
     columns = [jnp.ones_like(offset[:, 0])]
-    for _, lower, axis in _monomial_steps(offset.shape[1], order):
+    for lower, axis in _monomial_steps(offset.shape[1], order):
         columns.append(columns[lower] * offset[:, axis])
     return jnp.stack(columns, axis=1)
 

@@ -243,8 +243,8 @@ class Problem:
         return new
 
     def __repr__(self) -> str:
-        shown = "; ".join(f"{name}: {', '.join(map(repr, value))}" for name, value in self.bcs.items())
-        return f"Problem(fields={self.fields}, {shown.replace('; ', ', ')})"
+        shown = ", ".join(f"{name}: {', '.join(map(repr, value))}" for name, value in self.bcs.items())
+        return f"Problem(fields={self.fields}, {shown})"
 
 
 def _check_params(params: Any) -> None:

@@ -27,9 +27,7 @@ import numpy as np
 
 from jsmitsm.program import in_one_program
 from jsmitsm.smallsolve import general_inverse
-from jsmitsm.taylor import factorial, index_of, multi_indices
-
-Slot = tuple[int, tuple[int, ...]]
+from jsmitsm.taylor import Slot, factorial, index_of, multi_indices
 
 
 @dataclass(frozen=True)

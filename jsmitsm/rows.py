@@ -121,14 +121,15 @@ def _two_stage_rows(disc: Discretization, nums: Numbers, shared: Any) -> tuple[l
         conditioned[group.ids] = 0 if group.held else group.n_rows
     parts, order = [], []
     for count in np.unique(conditioned):
-        cls = Class(np.flatnonzero(conditioned == count), far, replace(disc.scheme, n_own=int(count)))
+        ids = np.flatnonzero(conditioned == count)
+        cls = Class(ids, far[ids], replace(disc.scheme, n_own=int(count)))
         given = operands(disc, nums, cls, shared)
         parts.append(
             assembly.recoveries(
-                cls.scheme, disc.points, wide, cls.ids, far[cls.ids], given, right_sides(disc, nums, cls)
+                cls.scheme, disc.points, wide, ids, cls.neighbours, given, right_sides(disc, nums, cls)
             )
         )
-        order.append(cls.ids)
+        order.append(ids)
     xp = jnp if is_traced(parts) else np
     back = np.argsort(np.concatenate(order))
     recovered = jax.tree.map(lambda *x: xp.concatenate(x)[back], *parts)

@@ -9,8 +9,6 @@ import numpy as np
 
 from jsmitsm import contour, levelset, packing, polygons, surface
 from jsmitsm.clouds import INTERIOR, Cloud
-from jsmitsm.evenness import Quality as Quality
-from jsmitsm.evenness import quality as quality
 from jsmitsm.packing import Spacing
 from jsmitsm.progress import bar
 

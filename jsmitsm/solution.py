@@ -15,7 +15,6 @@ from jsmitsm.boundary import is_traced
 from jsmitsm.clouds import Cloud
 from jsmitsm.errors import SolveError
 from jsmitsm.polynomials import derivative_table, monomials
-from jsmitsm.taylor import multi_indices
 
 # An estimated error above this part of the solution is a flag.
 LARGE = 0.1
@@ -296,10 +295,12 @@ def _nearest(centres: Any, points: Any, count: int) -> tuple[Any, Any]:
     if count == 1:
         return index, np.ones(index.shape)
     xp = jnp if is_traced(centres, points) else np
-    distance = xp.sqrt(xp.sum((points[:, None] - centres[index]) ** 2, axis=2))
+    square = xp.sum((points[:, None] - xp.asarray(centres)[index]) ** 2, axis=2)
+    # At a particle the root has no slope; it is taken as zero there.
+    distance = xp.where(square > 0, xp.sqrt(xp.where(square > 0, square, 1.0)), 0.0)
     # The farthest of them gets weight zero, so that none enters or leaves with a jump.
     weight = xp.maximum(1.0 - distance / distance.max(axis=1, keepdims=True), 0.0) ** 2
-    weight = weight + 1e-300
+    weight = weight + 1e-12  # where all are equally far; its square is a number in float32 too
     return index, weight / weight.sum(axis=1, keepdims=True)
 
 
@@ -313,8 +314,3 @@ def _evaluate(b, order, centres, taylor, points, near, weight):
         p = monomials(points - centres[near[:, k]], order)[:, lower] * factor
         total = total + weight[:, k, None] * jnp.einsum("mfk,mk->mf", taylor[near[:, k]], p)
     return total
-
-
-def size_of(dim: int, order: int) -> int:
-    """Taylor coefficients of one field."""
-    return len(multi_indices(dim, order))

@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 
 MultiIndex = tuple[int, ...]
+Slot = tuple[int, MultiIndex]
+"""A derivative of a field: the field and the multi-index."""
 
 
 @cache

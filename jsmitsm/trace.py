@@ -18,11 +18,11 @@ from jsmitsm.abstract import EXTRAS, FIELD, JUMPS, POINT, Facts
 from jsmitsm.jaxprs import EVERYTHING, NOTHING, levels
 from jsmitsm.jets import evaluate, plain
 from jsmitsm.linearize import Record, record
-from jsmitsm.operators import Slot, local_field
+from jsmitsm.operators import local_field
 from jsmitsm.program import fingerprint, kept
 from jsmitsm.recall import recalled
 from jsmitsm.series import Ring, full_series, variable
-from jsmitsm.taylor import count
+from jsmitsm.taylor import Slot, count
 
 # Particles interpreted at a time on the host: the temporaries stay in cache.  Fewer where arrays are wide.
 CHUNK = 4096

@@ -23,8 +23,9 @@ def no_windows():
 
 
 @pytest.mark.parametrize("page", sorted(p.name for p in DOCS.glob("*.md")))
-def test_blocks_of_a_page_run(page, capsys):
-    """Top to bottom in one namespace; the asserts in them are the test."""
+def test_blocks_of_a_page_run(page, capsys, tmp_path, monkeypatch):
+    """Top to bottom in one namespace, files in a directory of their own; the asserts in them are the test."""
+    monkeypatch.chdir(tmp_path)
     names: dict = {}
     for k, block in enumerate(re.findall(r"^```python\n(.*?)^```", (DOCS / page).read_text(), re.M | re.S)):
         exec(compile(block, f"{page}[{k}]", "exec"), names)
@@ -38,14 +39,8 @@ def test_examples_in_docstrings(name):
 
 
 def public():
-    """What ``import jsmitsm`` offers, by name, that is the package's own."""
-    names = {n for n in dir(jsmitsm) if not n.startswith("_")} | set(jsmitsm._LAZY_NAMES)
-    things = {name: getattr(jsmitsm, name) for name in sorted(names)}
-    return {
-        name: thing
-        for name, thing in things.items()
-        if callable(thing) and getattr(thing, "__module__", "").startswith("jsmitsm")
-    }
+    """The classes and functions that ``import jsmitsm`` offers, by name."""
+    return {name: getattr(jsmitsm, name) for name in jsmitsm.__all__ if callable(getattr(jsmitsm, name))}
 
 
 def test_every_public_name_is_documented_and_in_the_reference():

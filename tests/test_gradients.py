@@ -304,3 +304,19 @@ def test_gradient_through_evaluation_between_particles(line):
         return jnp.sum(sol(points)) + 0.1 * jnp.sum(sol.grad(points))
 
     assert float(jax.grad(f)(2.0)) == pytest.approx(difference(f, 2.0, 1.0), rel=BOUND)
+
+
+@pytest.mark.parametrize("at", [(0.4, 0.55), (0.5, 0.5), (0.375, 0.375)], ids=["anywhere", "a particle", "as far from four"])
+def test_a_blended_value_has_a_slope_everywhere(at):
+    """Against central differences where the weights are smooth; finite, and the same under jit, at every point."""
+    lattice = js.rectangle((0, 0), (1, 1), (5, 5))
+    sides = dict.fromkeys(("left", "right", "bottom", "top"), js.dirichlet(0.0))
+    sol = js.solve(js.Problem(lambda u, x: js.laplacian(u)(x) - 1.0, sides), lattice)
+    value = lambda x: sol(x[None], blend=True)[0]
+    at, slope = jnp.array(at), jax.grad(value)(jnp.array(at))
+    assert jnp.isfinite(slope).all()
+    assert abs(jax.jit(value)(at) - value(np.asarray(at))) < 1e-12
+    if at[0] == 0.4:
+        steps = 1e-5 * np.eye(2)
+        differences = [(value(at + s) - value(at - s)) / 2e-5 for s in steps]
+        assert np.allclose(slope, differences, atol=1e-7)

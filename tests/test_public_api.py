@@ -36,6 +36,13 @@ def test_every_public_name_is_there_and_says_what_it_is(name):
         assert inspect.getdoc(member), f"{name} has no docstring"
 
 
+def test_completion_offers_every_public_name():
+    """In a fresh process: what is imported when first used must be seen before."""
+    seen = in_a_fresh_process("import jsmitsm as js; print([n for n in dir(js) if n[0] != '_'])")
+    assert set(ast.literal_eval(seen)) == set(js.__all__) >= {*NAMES, "tune", "TuneResult", "plot", "files", "sdf"}
+    assert all(getattr(js, name) is not None for name in js.__all__)
+
+
 def test_the_signature_of_solve():
     parameters = inspect.signature(js.solve).parameters
     usual = {k: p.default for k, p in parameters.items() if p.kind is p.KEYWORD_ONLY}

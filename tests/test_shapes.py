@@ -10,7 +10,8 @@ from scipy.spatial import cKDTree
 
 import jsmitsm as js
 from jsmitsm import clouds, sdf
-from jsmitsm.shapes import from_polygon, from_sdf, quality
+from jsmitsm.evenness import quality
+from jsmitsm.shapes import from_polygon, from_sdf
 
 SQUARE = np.array([(0, 0), (1, 0), (1, 1), (0, 1)], float)
 L_SHAPE = np.array([(0, 0), (2, 0), (2, 1), (1, 1), (1, 2), (0, 2)], float)
