@@ -1,7 +1,8 @@
-"""Error against seconds: ``python -m benchmarks.pareto [--quick] [scene ...]``.
+"""Error against seconds: ``python -m benchmarks.pareto [--quick] [--only=NAME] [scene ...]``.
 
 Every method and order of the package, and other discretisations where they are installed
-(``pip install ".[bench]"``), on four scenes. Seconds are from arrays to values: neighbours,
+(``pip install ".[bench]"``; updes, which brings Gmsh and pandas along, by ``pip install updes``), on
+four scenes. ``--only=updes`` runs the contestants of that name and keeps the data of the others. Seconds are from arrays to values: neighbours,
 weights, assembly, solve. The first call, which compiles, stands apart from the median of the
 repeats; every repeat has its particles moved by a trifle, so that no factor is used again. The
 package differentiates its sources itself; the others get their numbers for nothing.
@@ -120,8 +121,9 @@ def posed(scene: Scene, cloud: js.Cloud, size: Any) -> peers.Posed:
         slope[cloud.groups[scene.slope]] = True
     cells = simplices(cloud) if cloud.dim == 2 else None
     return peers.Posed(
-        points, held, source, values, conductivity, gradient, functions, cells, size if scene.lattice else (), slope
-    )
+        points, held, source, values, conductivity, gradient, functions, cells, size if scene.lattice else (), slope,
+        lambda x: scene.case.operator(scene.exact, x),
+    )  # fmt: skip
 
 
 def _everywhere(function: Callable, points: Any) -> np.ndarray:
@@ -169,8 +171,12 @@ def theirs(run: Callable[[peers.Posed], np.ndarray]) -> Callable[[Scene, js.Clou
     return prepare
 
 
-def contestants(scene: Scene) -> Iterator[tuple[str, Any]]:
-    """Names, and what makes a function from a cloud to values."""
+def contestants(scene: Scene, only: str) -> Iterator[tuple[str, Any]]:
+    """Names that begin with ``only``, and what makes a function from a cloud to values."""
+    return (entry for entry in everyone(scene) if entry[0].startswith(only))
+
+
+def everyone(scene: Scene) -> Iterator[tuple[str, Any]]:
     for order in scene.orders:
         yield f"S {order}", ours("S", order)
     if scene.name in ("amoeba", "lattice"):
@@ -181,6 +187,7 @@ def contestants(scene: Scene) -> Iterator[tuple[str, Any]]:
         ("gfdm 4", lambda: peers.gfdm),
         *([("P1", lambda: peers.elements(1)), ("P2", lambda: peers.elements(2))] if scene.name != "ball" else []),
         *([("9-point", lambda: peers.compact)] if scene.lattice else []),
+        *([("updes r3", lambda: peers.dense(3, 1)), ("updes r7", lambda: peers.dense(7, 3))] if scene.name != "ball" else []),
     ):  # fmt: skip
         try:
             yield name, theirs(make())
@@ -213,10 +220,10 @@ def measure(scene: Scene, make: Any, size: Any) -> dict[str, Any] | None:
     return {"particles": len(cloud), "error": error, "first": seconds[0], "warm": warm, "repeats": len(seconds) - 1}
 
 
-def raced(scene: Scene, quick: bool) -> list[dict[str, Any]]:
+def raced(scene: Scene, quick: bool, only: str) -> list[dict[str, Any]]:
     lines = []
     print(f"\n{scene.name}: {scene.about}\n{'':10}{'N':>8}{'error':>10}{'first':>9}{'repeats':>9}  seconds")
-    for name, make in contestants(scene):
+    for name, make in contestants(scene, only):
         for size in scene.sizes[: 4 if quick else None]:
             line = measure(scene, make, size)
             if line is None:
@@ -291,10 +298,11 @@ def main(arguments: list[str]) -> None:
     quick = "--quick" in arguments
     names = [a for a in arguments if not a.startswith("-")] or list(SCENES)
     kept = json.loads(DATA.read_text())["lines"] if DATA.exists() else []
-    lines = [line for line in kept if line["scene"] not in names]
+    only = next((a.removeprefix("--only=") for a in arguments if a.startswith("--only=")), "")
+    lines = [line for line in kept if line["scene"] not in names or not line["name"].startswith(only)]
     about = machine.describe()
     for name in names:
-        lines += raced(SCENES[name], quick)
+        lines += raced(SCENES[name], quick, only)
         made = table(lines, about)
         if not quick:  # after every scene: a run that is stopped keeps what it has
             data = {"machine": about, "lines": lines, "tables": {"accuracy": made}}

@@ -36,6 +36,7 @@ class Posed:
     cells: np.ndarray | None = None  # simplices, for the finite elements
     lattice: tuple[int, ...] = ()
     slope: np.ndarray | None = None
+    formula: Callable[[Any], Any] | None = None  # the source at one place, for JAX
 
 
 def _finish(posed: Posed, rows: csc_matrix, right: np.ndarray) -> np.ndarray:
@@ -167,3 +168,58 @@ def compact(posed: Posed) -> np.ndarray:
     result = np.empty(nx * ny)
     result[ordered] = out.ravel()
     return result
+
+
+def dense(power: int, degree: int) -> Callable[[Posed], np.ndarray]:
+    """Collocation by r^power and polynomials over all particles, dense, in JAX (package updes).
+
+    Its solver compiles anew for every cloud object. The first call makes the cloud and compiles;
+    later calls at the same particles, to 1e-9 spacings, assemble and solve only.
+    """
+    import matplotlib
+
+    with matplotlib.rc_context():  # it sets a dark style
+        import updes
+    kept: dict[int, Any] = {}
+
+    def kernel(x, centre):
+        return updes.polyharmonic(x, centre, a=(power - 1) // 2)
+
+    def operator(x, centre, rbf, monomial, k):
+        slope = updes.nodal_gradient(x, centre, rbf, monomial)
+        return k[0] * updes.nodal_laplacian(x, centre, rbf, monomial) + k[1] * slope[0] + k[2] * slope[1]
+
+    def run(posed: Posed) -> np.ndarray:
+        if len(posed.points) not in kept:
+            kept[len(posed.points)] = (_updes_cloud(posed), lambda x, centres, rbf, fields: posed.formula(x))
+        cloud, source = kept[len(posed.points)]
+        place = np.array([cloud.renumbering_map[i] for i in range(cloud.N)])
+        own = np.argsort(place)
+        sides = {side: np.where(posed.held, posed.values, 0.0)[own[nodes]] for side, nodes in cloud.facet_nodes.items()}
+        k = [v[own] for v in (posed.conductivity, *posed.gradient.T)]
+        return np.asarray(updes.pde_solver_jit(operator, source, cloud, sides, kernel, degree, diff_args=k).vals)[place]
+
+    return run
+
+
+def _updes_cloud(posed: Posed) -> Any:
+    """Its own clouds are unit squares and Gmsh files; this one has the given particles."""
+    import jax.numpy as jnp
+    import updes
+
+    free = np.zeros(len(posed.held), bool) if posed.slope is None else posed.slope & ~posed.held
+    masks = {"d": posed.held, "n": free} if free.any() else {"d": posed.held}
+    cloud = updes.Cloud({kind: kind for kind in masks})
+    cloud.N = len(posed.points)
+    cloud.nodes = dict(enumerate(jnp.asarray(posed.points)))
+    cloud.facet_nodes = {kind: np.flatnonzero(mask).tolist() for kind, mask in masks.items()}
+    cloud.node_types = {i: next((kind for kind in masks if masks[kind][i]), "i") for i in range(cloud.N)}
+    cloud.Ni, cloud.Nd, cloud.Nn = (list(cloud.node_types.values()).count(kind) for kind in "idn")
+    cloud.outward_normals = {i: jnp.array([0.0, -1.0]) for i in cloud.facet_nodes.get("n", [])}
+    cloud.define_local_supports()
+    cloud.renumber_nodes()
+    cloud.sorted_nodes = cloud.sort_dict_by_keys(cloud.nodes)
+    cloud.sorted_local_supports = cloud.sort_dict_by_keys(cloud.local_supports)
+    if cloud.outward_normals:
+        cloud.sorted_outward_normals = cloud.sort_dict_by_keys(cloud.outward_normals)
+    return cloud
