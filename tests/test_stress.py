@@ -130,3 +130,13 @@ def test_a_problem_that_will_not_fit_is_refused_before_its_rows_are_made(monkeyp
     with pytest.raises(js.SolveError, match=f"(?s){words}.*GB.*fewer particles"):
         js.solve(task, cloud, solver=solver)
     assert not made
+
+
+@pytest.mark.parametrize("options", [{"formulation": "lsq"}, {"method": "I"}, {"method": "II"}], ids=str)
+def test_wider_rows_need_more_memory(monkeypatch, options):
+    """20 MB are enough for the rows of method S on these particles, not for blocks or neighbours of neighbours."""
+    task, cloud = st.problem("poisson", 2, HOME), st.lattice(2, 0.2, shape=(45, 45))
+    monkeypatch.setattr(js.sparse, "_memory", lambda: 2e7)
+    assert js.solve(task, cloud, solver="sparse").converged
+    with pytest.raises(js.SolveError, match="(?s)rows and the matrix.*GB.*fewer particles"):
+        js.solve(task, cloud, solver="sparse", **options)
