@@ -53,6 +53,7 @@ class Discretization:
     n_own: np.ndarray  # (N,) own conditions of each particle
     given_stencils: bool  # the user's: nothing outside them is looked at
     repeated: int = 0  # particles whose moment system was that of another
+    cut_off: tuple[int, ...] = ()  # particles whose support reaches outside of the given stencil
     lengths: int = 0  # eliminations of a constant operator, where one for all is not enough
 
     @property
@@ -137,6 +138,7 @@ def discretize(
         cloud, kernel, stencils, traced, rec, groups, scheme, [], held, partner, images, n_own, given_stencils
     )
     _check_supports(disc)
+    disc.cut_off = _cut_off(disc)
     disc.classes = sorted_classes(disc, np.flatnonzero(~held.all(axis=1)), stencils)
     return disc
 
@@ -253,6 +255,20 @@ def _check_supports(disc: Discretization) -> None:
             f"{needed[i]} that method {scheme.method} of order {scheme.rec.order} needs; choose larger supports "
             "(increase h, d, size or radius) or a lower order"
         )
+
+
+def _cut_off(disc: Discretization) -> tuple[int, ...]:
+    """The particles whose kernel would see more particles than their given stencil holds; none where that is traced."""
+    radius, near = disc.stencils.radius, disc.stencils.indices
+    if not disc.given_stencils or disc.kernel is None or radius is None or is_traced(disc.kernel, disc.points, near):
+        return ()
+    reach = np.broadcast_to(np.asarray(disc.kernel.h) * np.asarray(disc.kernel.d), (len(near),)) * EDGE
+    doubtful = np.flatnonzero((reach > np.asarray(radius) * EDGE) & ~disc.held.all(axis=1))
+    if not len(doubtful):
+        return ()
+    within_reach = within(np.asarray(disc.points), reach[doubtful], doubtful).indices >= 0
+    held = (np.asarray(near)[doubtful] >= 0).sum(axis=1)
+    return tuple(int(i) for i in doubtful[within_reach.sum(axis=1) > held])
 
 
 def _check_operator(traced: Traced, problem: Problem, order: int) -> None:

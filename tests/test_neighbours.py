@@ -147,3 +147,16 @@ def test_even_clouds_have_smaller_stencils_except_at_jumps():
     random[:80] = np.concatenate([np.stack([t, o], 1) for t in [np.linspace(0, 1, 20)] for o in (0 * t, 0 * t + 1)] +
                                  [np.stack([o, t], 1) for t in [np.linspace(0, 1, 22)[1:-1]] for o in (0 * t, 0 * t + 1)])
     assert np.median(size(cloud(random))) >= 28
+
+
+def test_a_support_that_reaches_outside_of_the_given_stencils_is_reported():
+    """Five neighbours in 1D reach two spacings; all twelve particles are cut off by nothing."""
+    rod = js.interval(0.0, 1.1, 12)
+    problem = js.Problem(lambda u, x: js.laplacian(u)(x), {"left": js.dirichlet(0.0), "right": js.dirichlet(1.0)})
+
+    def told(size, d):
+        sol = js.solve(problem, rod, kernel=js.Gaussian(h=0.1, d=d), stencils=js.stencils(rod, size=size))
+        return "reach outside of the given stencils" in sol.diagnose()
+
+    assert told(5, 3.5)
+    assert not told(5, 2.0) and not told(12, 20.0)
