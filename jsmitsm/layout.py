@@ -21,6 +21,8 @@ from jsmitsm.trace import Traced, trace
 
 # Neighbours for every free coefficient, by the order of the expansions, where the particles are evenly spaced.
 _EVEN_RATIO = {4: 1.5, 5: 1.5, 6: 1.5, 7: 1.65, 8: 1.65}
+# Particles whose given stencils are compared with their supports, at the most.
+_LOOKED_AT = 500
 
 
 @dataclass
@@ -258,7 +260,10 @@ def _check_supports(disc: Discretization) -> None:
 
 
 def _cut_off(disc: Discretization) -> tuple[int, ...]:
-    """The particles whose kernel would see more particles than their given stencil holds; none where that is traced."""
+    """Particles whose kernel would see more particles than their given stencil holds; none where that is traced.
+
+    Of many doubtful ones some are looked at: a search for all would cost as much as the stencils did.
+    """
     radius, near = disc.stencils.radius, disc.stencils.indices
     if not disc.given_stencils or disc.kernel is None or radius is None or is_traced(disc.kernel, disc.points, near):
         return ()
@@ -266,6 +271,7 @@ def _cut_off(disc: Discretization) -> tuple[int, ...]:
     doubtful = np.flatnonzero((reach > np.asarray(radius) * EDGE) & ~disc.held.all(axis=1))
     if not len(doubtful):
         return ()
+    doubtful = doubtful[:: -(-len(doubtful) // _LOOKED_AT)]
     within_reach = within(np.asarray(disc.points), reach[doubtful], doubtful).indices >= 0
     held = (np.asarray(near)[doubtful] >= 0).sum(axis=1)
     return tuple(int(i) for i in doubtful[within_reach.sum(axis=1) > held])
