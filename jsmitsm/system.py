@@ -125,8 +125,8 @@ class Run:
         self.messages.clear()  # those of an earlier step speak of other rows
         if disc.cut_off:
             self.messages.append(
-                f"The supports of at least {len(disc.cut_off)} particle(s), first {some(disc.cut_off)}, reach outside of the "
-                "given stencils, which cut them off: build wider stencils, or take a smaller h or d."
+                f"The supports of at least {len(disc.cut_off)} particle(s), first {some(disc.cut_off)}, reach outside "
+                "of the given stencils, which cut them off: build wider stencils, or take a smaller h or d."
             )
         if self.formulation == "auto":
             self.formulation = "lsq" if dz.prefers_least_squares(disc, nums) else "loo"
