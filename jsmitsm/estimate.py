@@ -19,7 +19,7 @@ from jsmitsm.progress import bar
 from jsmitsm.solution import Recipe, Solution
 from jsmitsm.solve import Fit, discretized
 from jsmitsm.system import Run
-from jsmitsm.taylor import multi_indices
+from jsmitsm.taylor import HIGHEST, multi_indices
 
 
 @bar("error estimate")
@@ -73,6 +73,11 @@ def _put(array: np.ndarray, at: np.ndarray, value: Any) -> np.ndarray:
 def _higher(fit: Fit, low: Discretization) -> tuple[Discretization, Numbers]:
     """The same problem with method S of order p + 2 on its own stencils."""
     order = fit.recipe.order + 2
+    if order > HIGHEST:
+        raise ValueError(
+            f"error_estimate: needs expansions of order p + 2 = {order}, and {HIGHEST} is the highest; solve at order "
+            f"{HIGHEST - 2} or below, or compare with the solution on a finer cloud"
+        )
     host = concrete(fit.cloud.points)
     if host is None:
         raise ValueError(

@@ -27,7 +27,7 @@ from jsmitsm.problem import Problem
 from jsmitsm.solution import Recipe, Solution
 from jsmitsm.solve import Fit, solve
 from jsmitsm.system import Run
-from jsmitsm.taylor import multi_indices
+from jsmitsm.taylor import HIGHEST, multi_indices
 
 # Weight of the Lebesgue bound: being e times above it costs as much as an error e^5 times larger.
 PENALTY = 5.0
@@ -38,8 +38,6 @@ MARGINS = (1.1, 1.35)
 UNBOUNDED = 1e300
 # A kernel must stand a support wider and narrower by this part.
 SHAKE = 0.02
-# No expansion has a higher order.
-HIGHEST = 14
 # Up to so many particles score and gradient are one compiled program. Beyond, what the program
 # would hold as constants takes long to compile, and a step is long anyway.
 COMPILED = 3000
@@ -166,7 +164,8 @@ class Objective:
         found, lebesgue, defect = self._solution(kernel)
         if self.reference is None:
             value = self.target(found)
-            if jnp.shape(value) != () or not jnp.issubdtype(jnp.result_type(value), jnp.floating):
+            number = isinstance(value, float | np.floating | jax.Array)
+            if not number or jnp.shape(value) != () or not jnp.issubdtype(jnp.result_type(value), jnp.floating):
                 raise ValueError(f"objective: expected a function that returns a real scalar, got {value!r}")
             score = value / self.scale
         else:

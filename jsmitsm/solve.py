@@ -20,6 +20,7 @@ from jsmitsm.problem import Problem
 from jsmitsm.progress import bar
 from jsmitsm.solution import Recipe, Solution
 from jsmitsm.system import Run
+from jsmitsm.taylor import HIGHEST
 
 METHODS = ("I", "II", "III", "S", "SSPH")
 
@@ -164,8 +165,10 @@ def _check(problem, cloud, method, order, kernel, stencils, formulation, solver,
     if not isinstance(throw, (bool, np.bool_)):
         raise ValueError(f"throw: expected True or False, got {throw!r}")
     _check_start(u0, (len(cloud), problem.fields))
-    if isinstance(order, bool) or not isinstance(order, (int, np.integer)) or not 1 <= order <= 14:
-        raise ValueError(f"order: expected a whole number from 1 to 14, the degree of the expansions, got {order!r}")
+    if isinstance(order, bool) or not isinstance(order, (int, np.integer)) or not 1 <= order <= HIGHEST:
+        raise ValueError(
+            f"order: expected a whole number from 1 to {HIGHEST}, the degree of the expansions, got {order!r}"
+        )
 
 
 def _check_start(u0: Any, shape: tuple[int, int]) -> None:

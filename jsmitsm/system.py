@@ -18,11 +18,12 @@ from jsmitsm.errors import SolveError, some
 from jsmitsm.flags import flags
 from jsmitsm.moments import Row
 from jsmitsm.problem import Problem
+from jsmitsm.taylor import HIGHEST
 
 # A solvable pure Neumann problem leaves a mean residual below this part of its data,
 COMPATIBLE = 1e-6
 # or one that falls to less than this part of itself from one order to two orders higher.
-KEPT, HIGHEST = 0.5, 14
+KEPT = 0.5
 # Between the fields of a system both vary more with the order: less than this is a doubt, not a refusal.
 UNSURE, FALLEN = 1e-3, 0.1
 DOUBT = "The data may not balance"

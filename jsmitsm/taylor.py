@@ -13,6 +13,9 @@ MultiIndex = tuple[int, ...]
 Slot = tuple[int, MultiIndex]
 """A derivative of a field: the field and the multi-index."""
 
+# No expansion has a higher order.
+HIGHEST = 14
+
 
 @cache
 def multi_indices(dim: int, degree: int) -> tuple[MultiIndex, ...]:

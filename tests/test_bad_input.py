@@ -294,6 +294,8 @@ SOLVE = [
     ("order-bool", solve(order=True), "order:", "whole number"),
     ("order-None", solve(order=None), "order:", "whole number"),
     ("order-text", solve(order="4"), "order:", "whole number"),
+    ("order-of-estimate", lambda: solve(cloud=js.interval(0, 1, 41), order=13)().error_estimate(), "error_estimate:",
+     "order 12"),
     ("order-below-operator", solve(order=1), "order:", "order=2"),
     ("order-below-biharmonic", solve(pde=lambda u, x: js.laplacian(js.laplacian(u))(x), order=3), "order:", "order=4"),
     ("order-beyond-cloud", solve(cloud=js.interval(0, 1, 4), order=8, method="SSPH"), "cloud:|stencils|neighbours",

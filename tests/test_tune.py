@@ -220,6 +220,7 @@ def test_a_nonlinear_problem():
         ({"parameters": ("h", "h")}, "each once"),
         ({"objective": "error"}, 'objective: expected "estimate" or a function'),
         ({"objective": lambda sol: sol.u}, "objective: expected a function that returns a real scalar"),
+        ({"objective": lambda sol: "small"}, "objective: expected a function that returns a real scalar"),
         ({"objective": lambda sol: jnp.nan}, "objective: it is nan at the start"),
         ({"optimizer": "adam"}, "optimizer: expected an optax transformation"),
         ({"steps": -1}, "steps: expected a whole number"),
