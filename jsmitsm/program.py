@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections import OrderedDict
 from collections.abc import Callable
 from functools import wraps
@@ -15,16 +16,22 @@ from jsmitsm.jaxprs import derivative
 
 _KEPT = 256
 _programs: OrderedDict[Any, Any] = OrderedDict()
+_lock = threading.Lock()  # solves may run in several threads
 
 
 def kept(key: Any, make: Callable[[], Any]) -> Any:
     """The program of this key, made when first asked for; the longest unused are dropped."""
-    if key not in _programs:
-        _programs[key] = make()
+    with _lock:
+        found = _programs.get(key)
+        if found is not None:
+            _programs.move_to_end(key)
+            return found
+    made = make()
+    with _lock:
+        _programs[key] = made
         if len(_programs) > _KEPT:
             _programs.popitem(last=False)
-    _programs.move_to_end(key)
-    return _programs[key]
+    return made
 
 
 def in_one_program(function: Callable[..., Any], static: tuple[str, ...] = ()) -> Callable[..., Any]:

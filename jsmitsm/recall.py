@@ -9,6 +9,7 @@ not remembered at all.
 from __future__ import annotations
 
 import functools
+import threading
 import types
 from collections import OrderedDict
 from collections.abc import Callable
@@ -103,6 +104,7 @@ def _names(code: types.CodeType) -> set[str]:
 
 
 _records: OrderedDict[Any, Any] = OrderedDict()
+_lock = threading.Lock()  # solves may run in several threads
 
 
 def recalled(function: Callable[..., Any], rest: Any, make: Callable[[], Any], keep: Callable[[Any], bool]) -> Any:
@@ -112,12 +114,14 @@ def recalled(function: Callable[..., Any], rest: Any, make: Callable[[], Any], k
         hash(key)
     except (Unknown, TypeError, RecursionError):
         return make()
-    if key in _records:
-        _records.move_to_end(key)
-        return _records[key]
+    with _lock:
+        if key in _records:
+            _records.move_to_end(key)
+            return _records[key]
     made = make()
     if keep(made):
-        _records[key] = made
-        if len(_records) > _KEPT:
-            _records.popitem(last=False)
+        with _lock:
+            _records[key] = made
+            if len(_records) > _KEPT:
+                _records.popitem(last=False)
     return made
