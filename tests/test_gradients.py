@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import jsmitsm as js
+from jsmitsm.assembly import QUICKLY
 
 STEP = 5e-5
 BOUND = 1e-6
@@ -20,6 +21,14 @@ NAMES = (
     "h", "d", "wall", "source", "diffusion", "reaction", "flux", "robin_a", "robin_b", "robin_value", "points", "tilt"
 )  # fmt: skip
 IN_2D = ("flux", "tilt")  # a Neumann side, and the angle by which its normals are turned
+
+
+def turned(cloud, t):
+    """The cloud in the plane with the points of the dict, every normal turned by its angle."""
+    inside = np.isnan(cloud.normals)
+    c, s = jnp.cos(t["tilt"]), jnp.sin(t["tilt"])
+    normals = np.where(inside, 0.0, cloud.normals) @ jnp.array([[c, s], [-s, c]])
+    return cloud.replace(points=t["points"], normals=jnp.where(inside, jnp.nan, normals))
 
 
 class Case:
@@ -56,12 +65,7 @@ class Case:
 
     def moved(self, t):
         """The cloud with the points of the dict, every normal turned by its angle."""
-        if self.dim == 1:
-            return self.cloud.replace(points=t["points"])
-        inside = np.isnan(self.cloud.normals)
-        c, s = jnp.cos(t["tilt"]), jnp.sin(t["tilt"])
-        turned = np.where(inside, 0.0, self.cloud.normals) @ jnp.array([[c, s], [-s, c]])
-        return self.cloud.replace(points=t["points"], normals=jnp.where(inside, jnp.nan, turned))
+        return turned(self.cloud, t) if self.dim > 1 else self.cloud.replace(points=t["points"])
 
     def solution(self, t, method="S", solver="dense", problem=None):
         return js.solve(
@@ -251,6 +255,79 @@ def test_every_output_with_respect_to_everything(line, method, problem, solver):
         for row, output, there in zip(rows, OUTPUTS, measured):
             assert along(row, direction) == pytest.approx(there, rel=BOUND, abs=10 * BOUND), (output, name)
         assert np.abs(measured).min() > 0, f"{name} moves nothing: nothing was tested"
+
+
+# What is left, compiled once each and with little effort. Differences are those of the host's path, which nothing traces.
+# The error estimate is the same code for every method, and tested above.
+@pytest.mark.parametrize("method, form", [("I", "loo"), ("II", "loo"), ("SSPH", "loo"), ("S", "lsq")])
+def test_the_other_methods_and_forms_with_respect_to_everything(line, method, form):
+    def outputs(t):
+        sol = js.solve(
+            line.problem(t), line.moved(t), method=method, order=4, formulation=form, solver="dense",
+            kernel=js.SuperGaussian(h=t["h"], d=t["d"]), stencils=line.stencils,
+        )  # fmt: skip
+        return jnp.stack([OUTPUTS[k](line, sol) for k in list(OUTPUTS)[:3]] + [jnp.sum(line.weights * sol.u**2)])
+
+    check_jacobian(outputs, line.theta, line.names)
+
+
+def check_jacobian(outputs, theta, names):
+    """Every row of the compiled Jacobian along a direction of every name, against differences."""
+    jacobian = jax.jit(jax.jacrev(outputs), compiler_options=QUICKLY)(theta)
+    rng = np.random.default_rng(7)
+    for name in names:
+        moved = rng.uniform(-1, 1, np.shape(theta[name]))
+        direction = {k: moved if k == name else np.zeros(np.shape(v)) for k, v in theta.items()}
+        measured = vector_difference(outputs, theta, direction)
+        exact = np.sum(np.asarray(jacobian[name]) * moved, axis=tuple(range(1, 1 + np.ndim(moved))))
+        assert np.allclose(exact, measured, rtol=BOUND, atol=10 * BOUND), name
+        assert np.abs(measured).max() > 1e-6, f"{name} moves nothing: nothing was tested"
+
+
+class Pair:
+    """Two coupled fields in the plane; a boundary value of one and the slope of the other on the same side."""
+
+    PLACES = np.array([[0.31, 0.42], [0.66, 0.71]])
+
+    def __init__(self):
+        self.cloud = mm.jittered(2, 6, jitter=0.2)
+        self.stencils = js.stencils(self.cloud, radius=0.75)
+        x = self.cloud.points
+        self.weights = np.cos(3.0 * x.sum(axis=1)) + 0.5
+        bottom = self.cloud.groups["bottom"]
+        self.theta = {
+            "h": 0.22, "d": 3.0, "coupling": 1.3, "source": 2.0, "wall": np.sin(1.0 + x[bottom].sum(axis=1)),
+            "flux": 0.7, "robin_a": 2.0, "robin_b": 0.5, "robin_value": 0.3, "points": x, "tilt": 0.0,
+        }  # fmt: skip
+
+    def outputs(self, t, method):
+        def pde(u, x, p):
+            coupling, source = p
+            one = js.laplacian(u[0])(x) - coupling * u[1](x) - source * jnp.cos(x[0])
+            return jnp.stack([one, js.laplacian(u[1])(x) + 0.5 * js.grad(u[0])(x)[0] - x[1]])
+
+        bcs = {
+            "bottom": [js.dirichlet(t["wall"], field=0), js.neumann(t["flux"], field=1)], "top": js.dirichlet(0.5),
+            "left": js.robin(t["robin_a"], t["robin_b"], t["robin_value"]), "right": js.dirichlet(0.1),
+        }  # fmt: skip
+        problem = js.Problem(pde, bcs, fields=2, params=(t["coupling"], t["source"]))
+        sol = js.solve(
+            problem, turned(self.cloud, t), method=method, order=3, stencils=self.stencils, solver="dense",
+            kernel=js.SuperGaussian(t["h"], t["d"]),
+        )  # fmt: skip
+        return jnp.stack([
+            jnp.sum(self.weights[:, None] * sol.u**2), jnp.sum(sol(self.PLACES) ** 2), jnp.sum(sol.grad(self.PLACES) ** 2),
+            jnp.sum(jnp.sin(self.weights[:, None, None] * sol.coefficients[:, 1:3])),
+        ])  # fmt: skip
+
+
+@pytest.mark.parametrize("method", ["S", "SSPH"])
+def test_two_fields_with_respect_to_everything(method):
+    pair = Pair()
+    x = pair.cloud.points
+    apart = np.linalg.norm(x[:, None] - x[None], axis=2)
+    assert np.abs(apart - pair.theta["h"] * pair.theta["d"]).min() > 8 * STEP
+    check_jacobian(lambda t: pair.outputs(t, method), pair.theta, pair.theta)
 
 
 TRANSFORMS = {

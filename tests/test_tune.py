@@ -14,7 +14,8 @@ import jsmitsm as js
 from jsmitsm import assembly
 
 room = import_module("jsmitsm.tuning")  # js.tune is the function
-from jsmitsm.objective import Objective
+from jsmitsm import objective as score_room
+from jsmitsm.objective import Objective, hand_kernel, reference
 
 N = 15
 
@@ -23,7 +24,7 @@ def exact(x):
     return jnp.sin(3.0 * x[0]) + x[0] ** 2
 
 
-def line(pde=None):
+def line(pde=None, exact=exact):
     ends = {"left": js.dirichlet(exact), "right": js.dirichlet(exact)}
     return js.Problem(pde or (lambda u, x: js.laplacian(u)(x) - js.laplacian(exact)(x)), ends)
 
@@ -132,6 +133,42 @@ def test_parameters_of_a_profile_of_ones_own():
     assert found.kernel.params["sharpness"] != 0.3
     assert found.history["params"]["sharpness"].shape == found.history["objective"].shape
     assert found.history["objective"].min() < found.history["objective"][0]
+
+
+def peak(x):
+    return jnp.exp(-(((x[0] - 1.02) / 0.1) ** 2))
+
+
+@pytest.mark.parametrize("function, order", [(exact, 6), (peak, 4)])
+def test_the_reference_is_the_best_of_its_candidates(function, order):
+    """The smooth function wants the higher order; a peak that no particle resolves makes it the worst of all."""
+    posed, hand = line(exact=function), hand_kernel(cloud.points)
+    there = np.array([float(function(x)) for x in cloud.points])
+    kernels = (hand, hand.replace(h=0.8 * hand.h))
+    made = {(p, k): js.solve(posed, cloud, order=p, kernel=kernel).u for p in (6, 4) for k, kernel in enumerate(kernels)}
+    best = min(made, key=lambda key: np.linalg.norm(made[key] - there))
+    chosen, solves = reference(posed, cloud, {"order": 2})
+    assert best[0] == order and solves == 4
+    assert [key for key, u in made.items() if np.array_equal(u, chosen[:, 0])] == [best]
+
+
+def test_a_reference_goes_on_where_candidates_fail(monkeypatch):
+    """No kernel given serves order 6: its default is tried. Nothing serves: the error names the orders."""
+    solve = score_room.solve
+
+    def without(fails):
+        def some(problem, cloud, **options):
+            if fails(options):
+                raise js.SolveError("singular")
+            return solve(problem, cloud, **options)
+
+        return some
+
+    monkeypatch.setattr(score_room, "solve", without(lambda o: o["order"] == 6 and o["kernel"] is not None))
+    assert reference(problem, cloud, {"order": 2})[1] == 5
+    monkeypatch.setattr(score_room, "solve", without(lambda o: True))
+    with pytest.raises(js.SolveError, match="no reference solution of order 4 or 6"):
+        reference(problem, cloud, {"order": 2})
 
 
 def test_an_objective_of_ones_own():
