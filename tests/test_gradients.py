@@ -284,50 +284,28 @@ def check_jacobian(outputs, theta, names):
         assert np.abs(measured).max() > 1e-6, f"{name} moves nothing: nothing was tested"
 
 
-class Pair:
-    """Two coupled fields in the plane; a boundary value of one and the slope of the other on the same side."""
+def pair(t):
+    """Two coupled fields: a value of one and the slope of the other on the right, a condition for both on the left."""
 
-    PLACES = np.array([[0.31, 0.42], [0.66, 0.71]])
+    def pde(u, x, p):
+        one = js.laplacian(u[0])(x) - p["reaction"] * u[1](x) - p["source"] * jnp.cos(x[0])
+        return jnp.stack([one, js.laplacian(u[1])(x) + p["diffusion"] * js.grad(u[0])(x)[0] - x[0]])
 
-    def __init__(self):
-        self.cloud = mm.jittered(2, 6, jitter=0.2)
-        self.stencils = js.stencils(self.cloud, radius=0.75)
-        x = self.cloud.points
-        self.weights = np.cos(3.0 * x.sum(axis=1)) + 0.5
-        bottom = self.cloud.groups["bottom"]
-        self.theta = {
-            "h": 0.22, "d": 3.0, "coupling": 1.3, "source": 2.0, "wall": np.sin(1.0 + x[bottom].sum(axis=1)),
-            "flux": 0.7, "robin_a": 2.0, "robin_b": 0.5, "robin_value": 0.3, "points": x, "tilt": 0.0,
-        }  # fmt: skip
-
-    def outputs(self, t, method):
-        def pde(u, x, p):
-            coupling, source = p
-            one = js.laplacian(u[0])(x) - coupling * u[1](x) - source * jnp.cos(x[0])
-            return jnp.stack([one, js.laplacian(u[1])(x) + 0.5 * js.grad(u[0])(x)[0] - x[1]])
-
-        bcs = {
-            "bottom": [js.dirichlet(t["wall"], field=0), js.neumann(t["flux"], field=1)], "top": js.dirichlet(0.5),
-            "left": js.robin(t["robin_a"], t["robin_b"], t["robin_value"]), "right": js.dirichlet(0.1),
-        }  # fmt: skip
-        problem = js.Problem(pde, bcs, fields=2, params=(t["coupling"], t["source"]))
-        sol = js.solve(
-            problem, turned(self.cloud, t), method=method, order=3, stencils=self.stencils, solver="dense",
-            kernel=js.SuperGaussian(t["h"], t["d"]),
-        )  # fmt: skip
-        return jnp.stack([
-            jnp.sum(self.weights[:, None] * sol.u**2), jnp.sum(sol(self.PLACES) ** 2), jnp.sum(sol.grad(self.PLACES) ** 2),
-            jnp.sum(jnp.sin(self.weights[:, None, None] * sol.coefficients[:, 1:3])),
-        ])  # fmt: skip
+    right = [js.dirichlet(t["wall"], field=0), js.neumann(t["flux"], field=1)]
+    bcs = {"left": js.robin(t["robin_a"], t["robin_b"], t["robin_value"]), "right": right}
+    return js.Problem(pde, bcs, fields=2, params={k: t[k] for k in ("source", "diffusion", "reaction")})
 
 
 @pytest.mark.parametrize("method", ["S", "SSPH"])
-def test_two_fields_with_respect_to_everything(method):
-    pair = Pair()
-    x = pair.cloud.points
-    apart = np.linalg.norm(x[:, None] - x[None], axis=2)
-    assert np.abs(apart - pair.theta["h"] * pair.theta["d"]).min() > 8 * STEP
-    check_jacobian(lambda t: pair.outputs(t, method), pair.theta, pair.theta)
+def test_two_fields_with_respect_to_everything(line, method):
+    def outputs(t):
+        sol = line.solution(t, method, "dense", pair(t))
+        return jnp.stack([
+            jnp.sum(line.weights[:, None] * sol.u**2), jnp.sum(sol(PLACES) ** 2), jnp.sum(sol.grad(PLACES) ** 2),
+            jnp.sum(jnp.sin(line.weights[:, None, None] * sol.coefficients[:, 1:3])),
+        ])  # fmt: skip
+
+    check_jacobian(outputs, line.theta, [*line.names, "flux"])
 
 
 TRANSFORMS = {
