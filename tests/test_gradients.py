@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import jsmitsm as js
+from jsmitsm import linsolve
 from jsmitsm.assembly import QUICKLY
 
 STEP = 5e-5
@@ -328,6 +329,25 @@ def test_the_sparse_solvers_follow_every_transform(line, transform):
     for solver in ("sparse", "iterative"):
         other = apply(lambda t, s=solver: line.u(t, "S", s), line.theta)
         assert np.allclose(other, dense, rtol=1e-8, atol=1e-8 * np.abs(dense).max()), solver
+
+
+def test_a_factorization_follows_transforms_of_the_right_hand_side(line):
+    """One factorisation serves values, gradients and maps; a traced operator is set up anew."""
+    def problem(source, wall, reaction=1.0):
+        pde = lambda u, x, p: js.laplacian(u)(x) - p[1] * u(x) - p[0] * jnp.exp(x[0])
+        return js.Problem(pde, {"left": js.dirichlet(wall), "right": js.neumann(0.3)}, params=(source, reaction))
+
+    ready = js.factorize(problem(1.0, 0.0), line.cloud)
+    u = lambda *numbers: ready.solve(problem(*numbers)).u
+    before = linsolve.factorisations()
+    slopes = jax.grad(lambda s, w: jnp.sum(u(s, w)), (0, 1))(2.0, 0.4)
+    assert slopes[0] == pytest.approx(np.sum(u(3.0, 0.4)) - np.sum(u(2.0, 0.4)), rel=1e-9)  # linear in both
+    assert slopes[1] == pytest.approx(np.sum(u(2.0, 1.4)) - np.sum(u(2.0, 0.4)), rel=1e-9)
+    for mapped in (jax.vmap(lambda s: u(s, 0.0)), jax.jit(jax.vmap(lambda s: u(s, 0.0)))):
+        assert np.allclose(mapped(jnp.array([1.0, 2.0]))[1], u(2.0, 0.0), rtol=0, atol=1e-11)
+    assert linsolve.factorisations() <= before + 1
+    total = lambda k: float(jnp.sum(u(1.0, 0.0, k)))
+    assert jax.grad(lambda k: jnp.sum(u(1.0, 0.0, k)))(1.2) == pytest.approx(difference(total, 1.2, 1.0), rel=BOUND)
 
 
 def test_an_error_estimate_is_mapped_and_refuses_abstract_points(line):
