@@ -164,10 +164,13 @@ class Factorization:
         run.problem, run.messages = problem, list(self._run.messages)
         x, good = run.solved(*self._matrix, dz.right_side(disc, nums, self._classes, self._rows))
         values = dz.with_held(disc, nums, x)
-        run.rows, run.nums, run.values = (self._classes, self._rows), nums, np.asarray(values)
+        traced = is_traced(values)
+        if not traced:
+            run.rows, run.nums, run.values = (self._classes, self._rows), nums, np.asarray(values)
         recipe = Recipe(disc.scheme.method, disc.rec.order, None, "loo", problem.fields)
         fit = Fit(problem, disc.cloud, disc.kernel, dz.table(disc), None, recipe)
-        return Solution(values, disc.cloud, recipe, fit, good, 1, run.stats(), report=run)
+        fine = jnp.isfinite(values).all() if traced else good
+        return Solution(values, disc.cloud, recipe, fit, fine, 1, run.stats(), report=None if traced else run)
 
     def __reduce__(self):
         raise TypeError(
@@ -179,7 +182,7 @@ class Factorization:
 
 
 def _same(x: Any, y: Any) -> bool:
-    return np.shape(x) == np.shape(y) and bool(np.array_equal(np.asarray(x), np.asarray(y)))
+    return np.shape(x) == np.shape(y) and not is_traced(x, y) and bool(np.array_equal(np.asarray(x), np.asarray(y)))
 
 
 @bar("factorize")

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import jsmitsm as js
+from jsmitsm import linsolve
 from jsmitsm.assembly import QUICKLY
 
 STEP = 5e-5
@@ -284,50 +285,28 @@ def check_jacobian(outputs, theta, names):
         assert np.abs(measured).max() > 1e-6, f"{name} moves nothing: nothing was tested"
 
 
-class Pair:
-    """Two coupled fields in the plane; a boundary value of one and the slope of the other on the same side."""
+def pair(t):
+    """Two coupled fields: a value of one and the slope of the other on the right, a condition for both on the left."""
 
-    PLACES = np.array([[0.31, 0.42], [0.66, 0.71]])
+    def pde(u, x, p):
+        one = js.laplacian(u[0])(x) - p["reaction"] * u[1](x) - p["source"] * jnp.cos(x[0])
+        return jnp.stack([one, js.laplacian(u[1])(x) + p["diffusion"] * js.grad(u[0])(x)[0] - x[0]])
 
-    def __init__(self):
-        self.cloud = mm.jittered(2, 6, jitter=0.2)
-        self.stencils = js.stencils(self.cloud, radius=0.75)
-        x = self.cloud.points
-        self.weights = np.cos(3.0 * x.sum(axis=1)) + 0.5
-        bottom = self.cloud.groups["bottom"]
-        self.theta = {
-            "h": 0.22, "d": 3.0, "coupling": 1.3, "source": 2.0, "wall": np.sin(1.0 + x[bottom].sum(axis=1)),
-            "flux": 0.7, "robin_a": 2.0, "robin_b": 0.5, "robin_value": 0.3, "points": x, "tilt": 0.0,
-        }  # fmt: skip
-
-    def outputs(self, t, method):
-        def pde(u, x, p):
-            coupling, source = p
-            one = js.laplacian(u[0])(x) - coupling * u[1](x) - source * jnp.cos(x[0])
-            return jnp.stack([one, js.laplacian(u[1])(x) + 0.5 * js.grad(u[0])(x)[0] - x[1]])
-
-        bcs = {
-            "bottom": [js.dirichlet(t["wall"], field=0), js.neumann(t["flux"], field=1)], "top": js.dirichlet(0.5),
-            "left": js.robin(t["robin_a"], t["robin_b"], t["robin_value"]), "right": js.dirichlet(0.1),
-        }  # fmt: skip
-        problem = js.Problem(pde, bcs, fields=2, params=(t["coupling"], t["source"]))
-        sol = js.solve(
-            problem, turned(self.cloud, t), method=method, order=3, stencils=self.stencils, solver="dense",
-            kernel=js.SuperGaussian(t["h"], t["d"]),
-        )  # fmt: skip
-        return jnp.stack([
-            jnp.sum(self.weights[:, None] * sol.u**2), jnp.sum(sol(self.PLACES) ** 2), jnp.sum(sol.grad(self.PLACES) ** 2),
-            jnp.sum(jnp.sin(self.weights[:, None, None] * sol.coefficients[:, 1:3])),
-        ])  # fmt: skip
+    right = [js.dirichlet(t["wall"], field=0), js.neumann(t["flux"], field=1)]
+    bcs = {"left": js.robin(t["robin_a"], t["robin_b"], t["robin_value"]), "right": right}
+    return js.Problem(pde, bcs, fields=2, params={k: t[k] for k in ("source", "diffusion", "reaction")})
 
 
 @pytest.mark.parametrize("method", ["S", "SSPH"])
-def test_two_fields_with_respect_to_everything(method):
-    pair = Pair()
-    x = pair.cloud.points
-    apart = np.linalg.norm(x[:, None] - x[None], axis=2)
-    assert np.abs(apart - pair.theta["h"] * pair.theta["d"]).min() > 8 * STEP
-    check_jacobian(lambda t: pair.outputs(t, method), pair.theta, pair.theta)
+def test_two_fields_with_respect_to_everything(line, method):
+    def outputs(t):
+        sol = line.solution(t, method, "dense", pair(t))
+        return jnp.stack([
+            jnp.sum(line.weights[:, None] * sol.u**2), jnp.sum(sol(PLACES) ** 2), jnp.sum(sol.grad(PLACES) ** 2),
+            jnp.sum(jnp.sin(line.weights[:, None, None] * sol.coefficients[:, 1:3])),
+        ])  # fmt: skip
+
+    check_jacobian(outputs, line.theta, [*line.names, "flux"])
 
 
 TRANSFORMS = {
@@ -350,6 +329,25 @@ def test_the_sparse_solvers_follow_every_transform(line, transform):
     for solver in ("sparse", "iterative"):
         other = apply(lambda t, s=solver: line.u(t, "S", s), line.theta)
         assert np.allclose(other, dense, rtol=1e-8, atol=1e-8 * np.abs(dense).max()), solver
+
+
+def test_a_factorization_follows_transforms_of_the_right_hand_side(line):
+    """One factorisation serves values, gradients and maps; a traced operator is set up anew."""
+    def problem(source, wall, reaction=1.0):
+        pde = lambda u, x, p: js.laplacian(u)(x) - p[1] * u(x) - p[0] * jnp.exp(x[0])
+        return js.Problem(pde, {"left": js.dirichlet(wall), "right": js.neumann(0.3)}, params=(source, reaction))
+
+    ready = js.factorize(problem(1.0, 0.0), line.cloud)
+    u = lambda *numbers: ready.solve(problem(*numbers)).u
+    before = linsolve.factorisations()
+    slopes = jax.grad(lambda s, w: jnp.sum(u(s, w)), (0, 1))(2.0, 0.4)
+    assert slopes[0] == pytest.approx(np.sum(u(3.0, 0.4)) - np.sum(u(2.0, 0.4)), rel=1e-9)  # linear in both
+    assert slopes[1] == pytest.approx(np.sum(u(2.0, 1.4)) - np.sum(u(2.0, 0.4)), rel=1e-9)
+    for mapped in (jax.vmap(lambda s: u(s, 0.0)), jax.jit(jax.vmap(lambda s: u(s, 0.0)))):
+        assert np.allclose(mapped(jnp.array([1.0, 2.0]))[1], u(2.0, 0.0), rtol=0, atol=1e-11)
+    assert linsolve.factorisations() <= before + 1
+    total = lambda k: float(jnp.sum(u(1.0, 0.0, k)))
+    assert jax.grad(lambda k: jnp.sum(u(1.0, 0.0, k)))(1.2) == pytest.approx(difference(total, 1.2, 1.0), rel=BOUND)
 
 
 def test_an_error_estimate_is_mapped_and_refuses_abstract_points(line):
