@@ -103,7 +103,8 @@ def _in_size_classes(function: Any) -> Any:
     @wraps(function)
     def padded(scheme, points, kernel, ids, neighbours, operands, each=(), whole=()):
         n, m = points.shape[0], ids.shape[0]
-        big, size = padded_size(n), padded_size(m)
+        # What is only looked up is padded further: few programs serve all clouds.
+        big, size = max(_FEW, 1 << (n - 1).bit_length()), padded_size(m)
         jac, one_for_all = operands.jac, operands.jac.shape[0] == 1
         points, kernel, data, whole = _widened((points, kernel, operands.data, whole), n, big)
         ids, neighbours, jac, own, each = _widened(
