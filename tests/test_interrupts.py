@@ -29,18 +29,20 @@ def interrupted(call, after):
     def press():
         sent.append(time.perf_counter())
         os.kill(os.getpid(), signal.SIGINT)
-    threading.Timer(after, press).start()
-    try:
-        call()
-    except KeyboardInterrupt:
-        return time.perf_counter() - sent[0]
+    # Python itself loses an interrupt that falls into the callback of a weak reference, of which JAX has many.
+    for attempt in range(3):
+        js.linsolve.clear_cache()
+        threading.Timer(after, press).start()
+        try:
+            call()
+        except KeyboardInterrupt:
+            return time.perf_counter() - sent[-1]
     raise AssertionError("it ended before it was interrupted")
 
 
 # Compiled before: that takes longer than all else.
 kernel = js.SuperGaussian(h=0.1, d=3.5)
 js.solve(problem, large), js.tune(problem, small, kernel, steps=2), right()
-js.linsolve.clear_cache()
 for after in (0.02, 0.05, 0.1, 0.2):  # in the search, the local fits, the assembly
     print("solve", interrupted(lambda: js.solve(problem, large), after))
     right()
