@@ -232,7 +232,7 @@ def raced(scene: Scene, quick: bool, only: str) -> list[dict[str, Any]]:
             shown = line["warm"] if line["warm"] is not None else math.nan
             print(f"{name:10}{line['particles']:8d}{line['error']:10.1e}{line['first']:9.3f}{shown:9.4f}", flush=True)
             slow = line["warm"] or line["first"]
-            if slow > PATIENCE / 2 or line["first"] > 5 * PATIENCE or (name.split()[0] in ("I", "II", "III", "SSPH") and slow > 1.0):
+            if slow > PATIENCE / 2 or line["first"] > 2.5 * PATIENCE or (name.split()[0] in ("I", "II", "III", "SSPH") and slow > 1.0):
                 break
     return lines
 
