@@ -126,6 +126,9 @@ def _read(path: Any) -> Any:
         start = file.read(1)
         file.seek(-min(os.path.getsize(path), 100), os.SEEK_END)
         end = file.read().split()
+        if os.fspath(path).endswith((".node", ".ele")):  # comments alone are nothing either
+            file.seek(0)
+            end = [line for line in file if not line.strip().startswith(b"#") and line.strip()]
     kind = {b"$": "gmsh", b"(": "ansys"}.get(start) if os.fspath(path).endswith(".msh") else None
     # Of such a file that ends too soon, or is of neither kind, meshio would look for the end for ever.
     whole = end and (end[-1].startswith(b"$End") if kind == "gmsh" else end[-1].endswith(b")") or kind != "ansys")

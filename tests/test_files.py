@@ -371,3 +371,11 @@ def test_a_missing_library_is_named_with_its_extra(monkeypatch):
     ):
         with pytest.raises(ImportError, match=rf'pip install "jsmitsm\[{extra}\]"'):
             call()
+
+
+def test_a_file_of_comments_alone(tmp_path):
+    """meshio would look for its first number for ever."""
+    path = tmp_path / "cube.node"
+    path.write_text("# nothing but\n# comments\n\n")
+    with pytest.raises(ValueError, match="mesh: .*empty"):
+        js.files.from_mesh(path)
