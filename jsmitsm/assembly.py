@@ -70,6 +70,11 @@ def padded_size(n: int) -> int:
     return -(-blocks // step) * step * _BLOCK
 
 
+def cloud_size(n: int) -> int:
+    """The size class of a cloud of n particles, which are only looked up: few programs serve all clouds."""
+    return max(_FEW, 1 << (n - 1).bit_length())
+
+
 def _pad(x: Any, n: int, size: int) -> Any:
     """Repeat the first row until ``size`` rows, where the leading axis has n; others pass."""
     if x is None or np.ndim(x) == 0 or x.shape[0] != n or n == size:
@@ -103,8 +108,7 @@ def _in_size_classes(function: Any) -> Any:
     @wraps(function)
     def padded(scheme, points, kernel, ids, neighbours, operands, each=(), whole=()):
         n, m = points.shape[0], ids.shape[0]
-        # What is only looked up is padded further: few programs serve all clouds.
-        big, size = max(_FEW, 1 << (n - 1).bit_length()), padded_size(m)
+        big, size = cloud_size(n), padded_size(m)
         jac, one_for_all = operands.jac, operands.jac.shape[0] == 1
         points, kernel, data, whole = _widened((points, kernel, operands.data, whole), n, big)
         ids, neighbours, jac, own, each = _widened(

@@ -43,7 +43,7 @@ PHASE = (0.9, 3.5)
 
 
 # An estimated error below this part of the solution clears what only suspects the resolution. Of the wrong
-# solutions of the stability sweep that were flagged for nothing else, the least estimate is 0.05.
+# solutions of the stability sweep that were flagged for nothing else, the least estimate is 0.07.
 CLEARED = 0.01
 # This part of the bounds above is reason enough to ask the estimate, and nothing to say before it has answered.
 HINT = 0.3

@@ -115,10 +115,7 @@ class _Iterate(NamedTuple):
 
 @partial(jax.jit, static_argnames="most")
 def _bicgstab(matrix: _Sparse, levels: Any, bottom: Any, b: Any, tolerance: Any, most: int) -> tuple[Any, Any, Any]:
-    """Best iterate, steps taken, and its residual relative to b.
-
-    Source: H. van der Vorst, SIAM J. Sci. Stat. Comput. 13 (1992).
-    """
+    """Best iterate, steps taken, and its residual relative to b: that of ``backends``, as one program."""
     guess = partial(_cycle, levels, bottom)
     times = lambda x: matrix.times(x, len(b))  # noqa: E731
     over = lambda a, c: jnp.where(c == 0, 0.0, a / jnp.where(c == 0, 1.0, c))  # noqa: E731

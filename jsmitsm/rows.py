@@ -211,7 +211,7 @@ def pieces(disc: Discretization, nums: Numbers, cls: Class, *more: Any) -> list[
 
 def _shared_out(what: str, disc: Discretization, cls: Class) -> Any:
     """Like map, on all cores: for the pieces of a class."""
-    sizes = assembly.padded_size(len(disc.points)), len(cls.ids) // PIECE, cls.neighbours.shape[1]
+    sizes = assembly.cloud_size(len(disc.points)), len(cls.ids) // PIECE, cls.neighbours.shape[1]
     return partial(side_by_side, program=(what, cls.scheme, sizes, disc.kernel is None))
 
 
