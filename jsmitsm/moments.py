@@ -6,8 +6,9 @@ s = (x_g - x_i) / l, scaled by a length l of the support, so nothing here knows 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -15,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm.kernels import EDGE, Gaussian, Kernel
-from jsmitsm.polynomials import functionals, monomials, whitening
+from jsmitsm.polynomials import FEW, combinations, functionals, monomials, whitening
 from jsmitsm.recursion import Recursion, Slot, constraints, substitution
 from jsmitsm.smallsolve import general_inverse, gram_inverse, min_norm, null_space, safe_root, solve_gram
 from jsmitsm.taylor import multi_indices
@@ -208,6 +209,7 @@ class System(NamedTuple):
     weight: Any  # (rows of data,)
     tests: Any  # (rows of data, free) or None
     data_scale: Any  # (ns, n_data)
+    times: Callable[[Any], Any] | None  # values @ matrix (F K, m) without forming them, where that is faster
 
 
 def local_system(
@@ -222,6 +224,8 @@ def local_system(
     (rows of data, F K): what the data are, the neighbours' values if not given.
     """
     rec = scheme.rec
+    plain = values is None and rec.fields == 1 and not scheme.n_data
+    times = partial(combinations, near.offset, rec.order) if plain and rec.size <= FEW else None
     p = monomials(near.offset, rec.order)
     ns, fields = p.shape[0], rec.fields
     weight = near.weight.at[0].set(0.0) if skip_self else near.weight
@@ -243,8 +247,8 @@ def local_system(
         z, own_solve = null_space(own_rows @ basis)
         basis = basis @ z
         tests = None if tests is None else tests @ z
-    phi = values @ basis
-    return System(solution, basis, own_rows, own_scale, own_solve, values, phi, weights, tests, data_scale)
+    phi = values @ basis if times is None else times(basis)
+    return System(solution, basis, own_rows, own_scale, own_solve, values, phi, weights, tests, data_scale, times)
 
 
 def moment_matrix(system: System) -> Any:
@@ -261,15 +265,22 @@ def functional(scheme: Scheme, near: Support, system: System, wanted: Any) -> tu
     """
     target = system.reduced.T @ wanted.T
     w = _fit(scheme, system.weight, system.phi, system.tests, target)
-    rest = wanted.T - system.values.T @ w
     size = jnp.max(jnp.abs(target), initial=0.0)
     # What phi^T w lacks of the target.
-    defect = jnp.max(jnp.abs(system.reduced.T @ rest), initial=0.0) / jnp.where(size > 0, size, 1.0)
+    defect = jnp.max(jnp.abs(target - system.phi.T @ w), initial=0.0) / jnp.where(size > 0, size, 1.0)
     if not (scheme.sourced or scheme.n_own):
         return w, jnp.zeros((scheme.rec.n_rows, wanted.shape[0])), jnp.zeros((0, wanted.shape[0])), defect
-    v_own = system.own_solve.T @ (system.elimination.basis.T @ rest)
-    v = system.elimination.particular.T @ (rest - system.own_rows.T @ v_own)
+    basis, particular = system.elimination.basis, system.elimination.particular
+    v_own = system.own_solve.T @ _lacking(system, wanted, w, basis) if scheme.n_own else jnp.zeros((0, wanted.shape[0]))
+    v = _lacking(system, wanted, w, particular) - (system.own_rows @ particular).T @ v_own
     return w, v, v_own, defect
+
+
+def _lacking(system: System, wanted: Any, w: Any, matrix: Any) -> Any:
+    """matrix^T (wanted^T - values^T w): what the data leave of each wanted functional of matrix's columns."""
+    if system.times is None:
+        return matrix.T @ (wanted.T - system.values.T @ w)
+    return matrix.T @ wanted.T - system.times(matrix).T @ w
 
 
 def row(scheme: Scheme, near: Support, solution: Elimination, own: Any, data: Any, tests: Any) -> Row:

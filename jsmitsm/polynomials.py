@@ -3,34 +3,71 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm.recursion import Recursion
 from jsmitsm.taylor import Slot, factorial, index_of, multi_indices
 
-
-@lru_cache(maxsize=32)
-def _monomial_steps(dim: int, order: int) -> list[tuple[int, int]]:
-    """For each monomial but the first: the place of one a degree lower, and the axis to multiply it with."""
-    place = index_of(dim, order)
-    steps = []
-    for a in multi_indices(dim, order)[1:]:
-        axis = next(j for j in range(dim) if a[j])
-        lower = tuple(v - (j == axis) for j, v in enumerate(a))
-        steps.append((place[lower], axis))
-    return steps
+# Up to so many monomials their combinations are made at once.
+FEW = 15
 
 
+@partial(jax.custom_jvp, nondiff_argnums=(1,))
 def monomials(offset: Any, order: int) -> Any:
-    """All monomials s^a with |a| <= order: (ns, D) -> (ns, K)."""
+    """All monomials s^a with |a| <= order: (ns, D) -> (ns, K), without a loop over them.
+
+    Each power is a product of s, s^2, s^4, ... or 1, as the bits of its exponent tell.
+    """
+    exponents = np.array(multi_indices(offset.shape[1], order))
+    out = jnp.ones((), offset.dtype)
+    for s, exponent in zip(offset.T, exponents.T, strict=True):
+        for bit in range(order.bit_length()):
+            out = out * jnp.where((exponent >> bit) % 2 == 1, s[:, None], 1.0)
+            s = s * s
+    # The barrier keeps the compiler from making them again for every use.
+    return jax.lax.optimization_barrier(out)
+
+
+@monomials.defjvp
+def _monomials_jvp(order, primals, tangents):
+    # Differentiated column by column, which needs no more products than there are columns.
+    _, slope = jax.jvp(lambda x: jnp.stack(_columns(x, order), axis=1), primals, tangents)
+    return monomials(*primals, order), slope
+
+
+def _columns(offset: Any, order: int) -> list[Any]:
+    """The monomials one by one, (ns,) each: one product makes each from another."""
+    place = index_of(offset.shape[1], order)
     columns = [jnp.ones_like(offset[:, 0])]
-    for lower, axis in _monomial_steps(offset.shape[1], order):
-        columns.append(columns[lower] * offset[:, axis])
-    return jnp.stack(columns, axis=1)
+    for a in multi_indices(offset.shape[1], order)[1:]:
+        axis = next(k for k, n in enumerate(a) if n)
+        columns.append(columns[place[tuple(n - (k == axis) for k, n in enumerate(a))]] * offset[:, axis])
+    return columns
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(1,))
+def combinations(offset: Any, order: int, matrix: Any) -> Any:
+    """monomials(offset, order) @ matrix, (ns, K) @ (K, m), for at most FEW monomials.
+
+    The outer products of the monomials and the matrix's rows are summed in one loop and the monomials never
+    stored, in half the time of the matrix product.
+    """
+    total = jnp.zeros((), offset.dtype)
+    for column, row in zip(_columns(offset, order), matrix, strict=True):
+        total = total + column[:, None] * row
+    return jax.lax.optimization_barrier(total)
+
+
+@combinations.defjvp
+def _combinations_jvp(order, primals, tangents):
+    (offset, matrix), (change, other) = primals, tangents
+    p, slope = jax.jvp(lambda x: monomials(x, order), (offset,), (change,))
+    return combinations(offset, order, matrix), slope @ matrix + p @ other
 
 
 @lru_cache(maxsize=256)
