@@ -15,12 +15,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm import closure, moments
-from jsmitsm.boundary import is_traced
 from jsmitsm.closure import Recovery
 from jsmitsm.kernels import Kernel
 from jsmitsm.moments import Block, Elimination, Row, Scheme, Support
 from jsmitsm.program import in_one_program
 from jsmitsm.recursion import row_lifts
+from jsmitsm.tracers import is_traced
 
 # Particles per block: larger blocks leave the cache and are several times slower; in one of a power of two, rows of
 # the small matrices fall on the same lines of the cache.

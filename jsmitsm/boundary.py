@@ -17,18 +17,7 @@ from jsmitsm.problem import Condition, Problem
 from jsmitsm.program import in_one_program, picked
 from jsmitsm.taylor import Slot
 from jsmitsm.trace import Traced, trace
-
-
-def is_traced(*trees: Any) -> bool:
-    """Whether any leaf is under a JAX transform."""
-    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees))
-
-
-def concrete(x: Any) -> Any:
-    """The numbers behind a value that only carries derivatives; None behind an abstract one."""
-    while isinstance(x, jax.core.Tracer):
-        x = getattr(x, "primal", None)
-    return x
+from jsmitsm.tracers import is_traced
 
 
 @dataclass

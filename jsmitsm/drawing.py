@@ -8,12 +8,12 @@ from typing import Any
 import jax
 import numpy as np
 
-from jsmitsm.boundary import is_traced
 from jsmitsm.clouds import Cloud
 from jsmitsm.kernels import Kernel
 from jsmitsm.neighbours import Stencils, within
 from jsmitsm.simplices import cut, refined, simplices
 from jsmitsm.solution import Solution
+from jsmitsm.tracers import is_traced
 
 # Okabe and Ito's palette, without its yellow, which is too light for dots on white.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")

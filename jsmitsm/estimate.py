@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm import discretize as dz
-from jsmitsm.boundary import concrete, is_traced
 from jsmitsm.clouds import Cloud
 from jsmitsm.discretize import Discretization, Numbers
 from jsmitsm.kernels import Kernel
@@ -20,6 +19,7 @@ from jsmitsm.solution import Recipe, Solution
 from jsmitsm.solve import Fit, discretized
 from jsmitsm.system import Run
 from jsmitsm.taylor import HIGHEST, multi_indices
+from jsmitsm.tracers import concrete, is_traced
 
 
 @bar("error estimate")

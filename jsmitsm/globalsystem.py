@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm import assembly
-from jsmitsm.boundary import concrete, is_traced
 from jsmitsm.layout import Class, Discretization, sorted_classes, table
 from jsmitsm.moments import Row
 from jsmitsm.neighbours import Stencils
@@ -18,6 +17,7 @@ from jsmitsm.program import in_one_program
 from jsmitsm.progress import each
 from jsmitsm.recursion import Recursion
 from jsmitsm.rows import operands, pieces, right_sides, shared_elimination
+from jsmitsm.tracers import concrete, is_traced
 
 
 def matrix(disc: Discretization, classes: list[Class], rows: list[Row]) -> tuple[Any, Any, Any]:

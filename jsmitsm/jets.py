@@ -34,6 +34,7 @@ from jsmitsm.series import (
     variable,
     xp_of,
 )
+from jsmitsm.tracers import is_traced
 
 # A loop with more operations than this stays a loop in a compiled program.
 UNROLL = 200
@@ -206,7 +207,7 @@ def taylor_coefficients(function: Callable[..., Any], points: Any, degree: int, 
         return full_series(Ring(dim, degree), evaluate(closed.jaxpr, consts, inputs, dim, degree)[0], n)
 
     data = (points, leaves, closed.consts)
-    if any(isinstance(v, jax.core.Tracer) for v in jax.tree.leaves(data)):
+    if is_traced(data):
         return kept((fingerprint(closed.jaxpr), dim, degree), lambda: jax.jit(series))(*data)
     return series(*jax.tree.map(np.asarray, data))
 

@@ -9,7 +9,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from jsmitsm.boundary import Group, concrete, group_conditions, in_words, is_traced
+from jsmitsm.boundary import Group, group_conditions, in_words
 from jsmitsm.clouds import Cloud
 from jsmitsm.kernels import EDGE, Constant, Gaussian, Kernel
 from jsmitsm.moments import Scheme
@@ -18,6 +18,7 @@ from jsmitsm.periodic import Images, periodic_images
 from jsmitsm.problem import Problem
 from jsmitsm.recursion import Recursion, free_indices, recursion
 from jsmitsm.trace import Traced, trace
+from jsmitsm.tracers import concrete, is_traced
 
 # Neighbours for every free coefficient, by the order of the expansions, where the particles are evenly spaced.
 _EVEN_RATIO = {4: 1.5, 5: 1.5, 6: 1.5, 7: 1.65, 8: 1.65}

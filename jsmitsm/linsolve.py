@@ -33,6 +33,7 @@ from jsmitsm.sparse import (
     near_null_vector,
     refuse_too_large,
 )
+from jsmitsm.tracers import is_traced
 
 __all__ = [
     "Factor",
@@ -102,7 +103,7 @@ def solve(
       >>> x.tolist()
       [1.0, 2.0]
     """
-    traced = any(isinstance(a, jax.core.Tracer) for a in (data, rows, cols, b))
+    traced = is_traced(data, rows, cols, b)
     if isinstance(points, jax.core.Tracer):
         points = None
     points = _check(data, rows, cols, b, n, points, solver)

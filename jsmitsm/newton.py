@@ -10,11 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm import discretize as dz
-from jsmitsm.boundary import concrete, is_traced, sample
+from jsmitsm.boundary import sample
 from jsmitsm.errors import SolveError
 from jsmitsm.progress import bar
 from jsmitsm.system import Run
 from jsmitsm.taylor import multi_indices
+from jsmitsm.tracers import concrete, is_traced
 
 MOST = 50
 TOLERANCE = 1e-10

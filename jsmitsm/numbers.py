@@ -10,13 +10,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jsmitsm.boundary import is_traced, merged
+from jsmitsm.boundary import merged
 from jsmitsm.layout import Discretization, closed
 from jsmitsm.problem import Problem
 from jsmitsm.program import in_one_program, picked
 from jsmitsm.recursion import Recursion, source_rows
 from jsmitsm.series import Ring, mul
 from jsmitsm.taylor import Slot, factorial, index_of, multi_indices
+from jsmitsm.tracers import is_traced
 
 # Coefficients and sources up to this have squares that are numbers.
 LARGEST = 1e150

@@ -12,6 +12,7 @@ import numpy as np
 
 from jsmitsm.clouds import Cloud
 from jsmitsm.problem import Problem
+from jsmitsm.tracers import is_traced
 
 
 @dataclass(frozen=True)
@@ -31,7 +32,7 @@ class Images:
         """Points (N, D) with the images behind, (N + M, D)."""
         if not len(self.owner):
             return points
-        xp = jnp if isinstance(points, jax.core.Tracer) else np
+        xp = jnp if is_traced(points) else np
         return xp.concatenate([points, points[self.owner] + self.shift])
 
     def searched(self, points: np.ndarray) -> np.ndarray:
@@ -45,7 +46,7 @@ class Images:
         """Values (N, ...) with those of the images behind."""
         if not len(self.owner):
             return values
-        return (jnp if isinstance(values, jax.core.Tracer) else np).concatenate([values, values[self.owner]])
+        return (jnp if is_traced(values) else np).concatenate([values, values[self.owner]])
 
     def owners(self, index: Any) -> Any:
         """Neighbour numbers with images replaced by their owners; -1 stays."""

@@ -13,6 +13,7 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
 from jsmitsm.jaxprs import derivative
+from jsmitsm.tracers import is_traced
 
 _KEPT = 256
 _programs: OrderedDict[Any, Any] = OrderedDict()
@@ -44,7 +45,7 @@ def in_one_program(function: Callable[..., Any], static: tuple[str, ...] = ()) -
 
     @wraps(function)
     def run(*arguments: Any, **named: Any) -> Any:
-        traced = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((arguments, named)))
+        traced = is_traced(arguments, named)
         return (program if traced else function)(*arguments, **named)
 
     return run

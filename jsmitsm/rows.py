@@ -13,7 +13,6 @@ import numpy as np
 
 from jsmitsm import assembly, moments
 from jsmitsm.assembly import Operands
-from jsmitsm.boundary import is_traced
 from jsmitsm.kernels import Kernel
 from jsmitsm.layout import Class, Discretization
 from jsmitsm.moments import Elimination, Row
@@ -23,6 +22,7 @@ from jsmitsm.program import in_one_program
 from jsmitsm.progress import each, shown
 from jsmitsm.repeats import repeats
 from jsmitsm.threads import cores, side_by_side
+from jsmitsm.tracers import is_traced
 
 # Particles that the cores share in pieces, between whose ends a progress bar moves; every piece costs a millisecond.
 PIECE, MOST_PIECES = 4096, 32

@@ -11,10 +11,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jsmitsm.boundary import is_traced
 from jsmitsm.clouds import Cloud
 from jsmitsm.errors import SolveError
 from jsmitsm.polynomials import derivative_table, monomials
+from jsmitsm.tracers import is_traced
 
 # An estimated error above this part of the solution is a flag.
 LARGE = 0.1

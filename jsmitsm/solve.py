@@ -9,7 +9,6 @@ import jax
 import numpy as np
 
 from jsmitsm import discretize as dz
-from jsmitsm.boundary import is_traced
 from jsmitsm.clouds import Cloud
 from jsmitsm.discretize import Discretization
 from jsmitsm.kernels import Kernel
@@ -21,6 +20,7 @@ from jsmitsm.progress import bar
 from jsmitsm.solution import Recipe, Solution
 from jsmitsm.system import Run
 from jsmitsm.taylor import HIGHEST
+from jsmitsm.tracers import is_traced
 
 METHODS = ("I", "II", "III", "S", "SSPH")
 

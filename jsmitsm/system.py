@@ -12,13 +12,13 @@ import numpy as np
 
 from jsmitsm import discretize as dz
 from jsmitsm import health, linsolve
-from jsmitsm.boundary import is_traced
 from jsmitsm.discretize import Class, Discretization, Numbers
 from jsmitsm.errors import SolveError, some
 from jsmitsm.flags import flags
 from jsmitsm.moments import Row
 from jsmitsm.problem import Problem
 from jsmitsm.taylor import HIGHEST
+from jsmitsm.tracers import is_traced
 
 # A solvable pure Neumann problem leaves a mean residual below this part of its data,
 COMPATIBLE = 1e-6

@@ -23,6 +23,7 @@ from jsmitsm.program import fingerprint, kept
 from jsmitsm.recall import recalled
 from jsmitsm.series import Ring, full_series, variable
 from jsmitsm.taylor import Slot, count
+from jsmitsm.tracers import is_traced
 
 # Particles interpreted at a time on the host: the temporaries stay in cache.  Fewer where arrays are wide.
 CHUNK = 4096
@@ -110,8 +111,7 @@ class Traced:
     def _compute(self, inputs: _Inputs, degree: int, jac: bool, res: bool) -> tuple[Any, Any]:
         read = self._read(jac, res)
         inputs = inputs.only(read)
-        leaves = jax.tree.leaves(inputs)
-        if any(isinstance(v, jax.core.Tracer) for v in leaves):
+        if is_traced(inputs):
             return self._compiled(inputs, degree, jac, res)
         inputs = jax.tree.map(np.asarray, inputs)
         n = len(inputs.points)
@@ -297,7 +297,7 @@ def trace(
 
 
 def _holds_tracers(traced: Traced) -> bool:
-    return any(isinstance(c, jax.core.Tracer) for c in traced._record.consts)
+    return is_traced(traced._record.consts)
 
 
 def _classified(r: Record, dim: int, fields: int, n_extras: int, params_tree: Any) -> Traced:

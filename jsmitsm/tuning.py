@@ -14,7 +14,6 @@ from typing import Any
 import jax
 import numpy as np
 
-from jsmitsm.boundary import is_traced
 from jsmitsm.clouds import Cloud
 from jsmitsm.descent import Descent
 from jsmitsm.kernels import Kernel
@@ -24,6 +23,7 @@ from jsmitsm.problem import Problem
 from jsmitsm.progress import bar
 from jsmitsm.solution import Solution
 from jsmitsm.solve import _check, solve
+from jsmitsm.tracers import is_traced
 
 OPTIONS = ("method", "order", "stencils", "basis_terms", "formulation", "solver", "u0", "throw")
 
