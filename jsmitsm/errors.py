@@ -1,4 +1,4 @@
-"""The package's own exception."""
+"""The package's own exceptions."""
 
 from __future__ import annotations
 
@@ -20,6 +20,14 @@ class SolveError(RuntimeError):
     def __init__(self, message: str, particles: Sequence[int] = ()) -> None:
         super().__init__(message)
         self.particles: tuple[int, ...] = tuple(int(i) for i in particles)
+
+
+class SingularMatrix(SolveError):
+    """A linear system without a unique finite solution; `unknowns` at fault, the worst first."""
+
+    def __init__(self, message: str, unknowns: Any = ()) -> None:
+        super().__init__(message)
+        self.unknowns: tuple[int, ...] = tuple(int(i) for i in unknowns)
 
 
 def some(index: Any, most: int = 6) -> str:

@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 
 from jsmitsm import discretize as dz
-from jsmitsm import linsolve
 from jsmitsm.errors import some
 from jsmitsm.health import LEBESGUE
 
@@ -131,7 +130,7 @@ def _condition(run: Any, values: np.ndarray, nums: Any, out: list[str], found: d
         return
     rec = run.disc.rec
     order = max(rec.order - q for q in rec.degrees)
-    found["condition"] = linsolve.condition_estimate(run.factor)
+    found["condition"] = run.factor.condition()
     usual = len(values) ** ((2 if run.formulation == "lsq" else 1) * order / rec.dim)
     found["excess"] = found["condition"] / usual
     if found["excess"] > SINGULAR[run.formulation]:

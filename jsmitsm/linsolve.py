@@ -22,28 +22,18 @@ import numpy as np
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
-from jsmitsm.errors import SolveError
+from jsmitsm.choice import DENSE_MAX, refuse_too_large
+from jsmitsm.errors import SingularMatrix, SolveError
 from jsmitsm.factorcache import Settings, clear_cache, factorisations, lookup
-from jsmitsm.sparse import (
-    DENSE_MAX,
-    Factor,
-    SingularMatrix,
-    condition_estimate,
-    estimate_memory,
-    near_null_vector,
-    refuse_too_large,
-)
+from jsmitsm.sparse import Factor
 from jsmitsm.tracers import is_traced
 
 __all__ = [
     "Factor",
     "SingularMatrix",
     "clear_cache",
-    "condition_estimate",
-    "estimate_memory",
     "factor",
     "factorisations",
-    "near_null_vector",
     "refuse_too_large",
     "solve",
 ]

@@ -9,93 +9,27 @@ if not the next one takes over and a message says so.
 
 from __future__ import annotations
 
-import os
 import threading
 import time
-from functools import cache, partial
+from functools import partial
 from typing import Any
 
-import jax
 import numpy as np
 
-from jsmitsm.backends import BACKENDS, ITERATIVE, SuperLU, installed
-from jsmitsm.errors import SolveError
+from jsmitsm.backends import BACKENDS, ITERATIVE, SuperLU
+from jsmitsm.choice import DENSE_MAX, choose_backends
+from jsmitsm.conditioning import inverse_norm, near_null_vector
+from jsmitsm.errors import SingularMatrix
 from jsmitsm.interrupts import interruptible
 from jsmitsm.ordering import nested_dissection
 from jsmitsm.progress import bar
-from jsmitsm.threads import cores
 
-# Unknowns up to which LAPACK is asked. It beats the sparse codes a little further, but uses several
-# threads there, which on a busy machine wait for one another a hundred times longer than they work.
-DENSE_MAX = 140
-# Unknowns from which multigrid was faster than LU, refined to round-off and with one adjoint solve.
-ITERATIVE_MIN = {2: 200_000, 3: 6_000}
-# Unknowns from which factors in float32, with refinement, were faster than those in float64.
-MIXED_MIN = 15_000
-# Unknowns from which PARDISO on two cores was faster than either.
-PARDISO_MIN = {2: 200_000, 3: 2_000}
 BACKWARD_ERROR = 1e-9  # what is accepted of a direct solver
 BACKWARD_ERROR_ITERATIVE = 1e-12  # of an iterative one, which reaches round-off unless it stalls
 SINGULAR = 1e15  # condition number (scaled) above which no digit of a solution means anything
 # Unknowns from which a factorisation may take seconds: a thread costs less than a millisecond.
 LONG = 10_000
 COUNTS = {"factorisations": 0}
-
-
-class SingularMatrix(SolveError):
-    """A linear system without a unique finite solution; `unknowns` at fault, the worst first."""
-
-    def __init__(self, message: str, unknowns: Any = ()) -> None:
-        super().__init__(message)
-        self.unknowns: tuple[int, ...] = tuple(int(i) for i in unknowns)
-
-
-def estimate_memory(n: int, nnz: int, dim: int) -> int:
-    """Bytes the direct solver needs for n unknowns and nnz entries in `dim` dimensions, roughly.
-
-    Fitted to nested dissection of meshless matrices with 12 to 100 entries a row (1e4 to 4e5
-    unknowns in 2D, 4e3 to 5e4 in 3D), within some 25%: with s = nnz / n entries a row, the factors
-    have n s (1.3 log2 n - 8) entries in 2D and 0.45 n^1.45 s^0.9 in 3D, of 12 bytes each, and the
-    matrix and its copies take 50 bytes an entry. The iterative solver needs no more than about 70
-    bytes for every entry of the matrix.
-
-    Example:
-      >>> round(estimate_memory(102_400, 2_037_720, 2) / 1e6)
-      435
-    """
-    n, per_row = max(int(n), 2), nnz / max(int(n), 1)
-    if dim >= 3:
-        fill = 0.45 * n**1.45 * per_row**0.9
-    elif dim == 2:
-        fill = n * per_row * max(1.3 * np.log2(n) - 8.0, 2.0)
-    else:
-        fill = 3.0 * nnz
-    return int(12 * min(fill, float(n) * n) + 50 * nnz)
-
-
-def assembly_memory(entries: int) -> int:
-    """Bytes that the rows of all particles and the global matrix need, for so many entries in them.
-
-    Fitted to 1.4e4 to 1.6e5 particles with 16 to 40 neighbours, 2D and 3D: the rows, the triplets and
-    their copies take 84 to 90 bytes an entry beyond the compiled programs.
-    """
-    return 90 * int(entries)
-
-
-def refuse_too_large(
-    n: int, entries: int, points: np.ndarray | None, solver: str, elliptic: bool, made: int | None = None
-) -> None:
-    """Raise SolveError where a system of n unknowns would not fit in memory, before any of it is made.
-
-    entries: of its matrix; made: those of the matrix and of what it is assembled from, where they are more.
-    """
-    needed, there = assembly_memory(entries if made is None else made), _memory()
-    if needed > 0.8 * there:
-        raise SolveError(
-            f"the rows and the matrix would need about {needed / 1e9:.2g} GB for {n} unknowns, of {there / 1e9:.2g} GB "
-            "of memory; use fewer particles, a lower order or smaller supports"
-        )
-    choose_backends(n, entries, points, solver, elliptic)
 
 
 class Factor:
@@ -203,15 +137,49 @@ class Factor:
             before, after = after, before
         rhs = before[:, None] * wide
         with self._lock:
-            if self.order is None:
-                x = self._solve_scaled(rhs, transpose)
-            else:
-                x = np.empty_like(rhs)
-                x[self.order] = self._solve_scaled(rhs[self.order], transpose)
+            ordered = rhs if self.order is None else rhs[self.order]
+            x = self._in_callers_order(self._solve_scaled(ordered, transpose))
         x *= after[:, None]
         x[:, ~finite] = np.nan
         self.info["seconds"]["solve"] = time.perf_counter() - started
         return x.reshape(b.shape)
+
+    def condition(self) -> float:
+        """Condition number in the 1-norm, of the matrix with rows and columns scaled to about one.
+
+        The scaling takes out the units of equations and unknowns, so the number says how many digits
+        are lost in a solve, whatever they are.
+
+        Example:
+          >>> index = np.arange(2)
+          >>> Factor(np.array([1.0, 2.0**-20]), index, index, 2).condition()
+          1.0
+        """
+        if not self.n:
+            return 1.0
+        krylov = self._backends[0] in ITERATIVE  # two digits of the number are enough
+        apply = partial(self._lu.apply, tolerance=1e-6) if krylov else self._lu.apply
+        return self._norms[True] * inverse_norm(apply, self.n)
+
+    def near_null_vector(self) -> np.ndarray:
+        """Unit vector (n,) the scaled matrix maps nearest to zero.
+
+        Its largest entries name the unknowns a (nearly) singular matrix leaves undetermined.
+
+        Example:
+          >>> f = Factor(np.array([1, 1, 1, 1, 1.001]), [0, 1, 1, 2, 2], [0, 1, 2, 1, 2], 3)
+          >>> np.round(abs(f.near_null_vector()), 3).tolist()
+          [0.0, 0.707, 0.707]
+        """
+        return self._in_callers_order(near_null_vector(self._lu.apply, self.n))
+
+    def _in_callers_order(self, x: np.ndarray) -> np.ndarray:
+        """Rows in the order of elimination put back at their places."""
+        if self.order is None:
+            return x
+        out = np.empty_like(x)
+        out[self.order] = x
+        return out
 
     def _solve_scaled(self, b: np.ndarray, transpose: bool) -> np.ndarray:
         """Solve with the scaled, ordered matrix; change the backend where one fails."""
@@ -232,7 +200,7 @@ class Factor:
                 return x
             raise SingularMatrix(
                 f"the linear system cannot be solved: {backend} {told} after refinement",
-                self._unknowns_of(near_null_vector(self)),
+                _largest(self.near_null_vector()),
             )
 
     def _give_way(self, told: str) -> bool:
@@ -305,12 +273,12 @@ class Factor:
             return
         if small:
             return
-        condition = condition_estimate(self) if np.isfinite(growth) else np.inf
+        condition = self.condition() if np.isfinite(growth) else np.inf
         if condition < SINGULAR or (np.isinf(condition) and self._give_way("broke down")):
             return
         raise SingularMatrix(
             f"the matrix is singular to working precision (condition {condition:.1e})",
-            self._unknowns_of(near_null_vector(self)),
+            _largest(self.near_null_vector()),
         )
 
     def _dependent_unknowns(self) -> list[int]:
@@ -322,73 +290,13 @@ class Factor:
         pattern.eliminate_zeros()
         unmatched = np.flatnonzero(maximum_bipartite_matching(pattern, perm_type="column") < 0)
         if len(unmatched):
-            return self._original(unmatched)
+            return (unmatched if self.order is None else self.order[unmatched]).tolist()
         try:  # shifted a little, the matrix has a factor and its null vector still dominates
             shifted = self.matrix + 1e-11 * sparse.eye_array(self.n, format="csc")
             backend = SuperLU(sparse.csc_array(shifted), ordered=False)
         except RuntimeError:
             return []
-        return self._unknowns_of(_inverse_iteration(backend, self.n))
-
-    def _unknowns_of(self, vector: np.ndarray) -> list[int]:
-        """Unknowns with the largest entries of a vector in the ordered numbering."""
-        size = abs(vector)
-        if not np.isfinite(size).all() or not size.any():
-            return []
-        worst = np.argsort(-size, kind="stable")
-        return self._original(worst[size[worst] >= 0.1 * size.max()])
-
-    def _original(self, index: np.ndarray) -> list[int]:
-        """Unknowns in the caller's numbering."""
-        return (index if self.order is None else self.order[index]).tolist()
-
-
-def choose_backends(n: int, nnz: int, points: np.ndarray | None, solver: str, elliptic: bool) -> list[str]:
-    """Backends to be tried in turn."""
-    if solver == "dense" or (solver == "auto" and n <= DENSE_MAX):
-        return ["lapack"]
-    # Without coordinates there is no good order, so the direct solver finds its own.
-    direct = ["colamd"] if points is None or n <= DENSE_MAX else ["nested dissection", "colamd"]
-    dim = 2 if points is None else points.shape[1]
-    if n >= PARDISO_MIN.get(dim, n + 1) and cores() > 1 and installed("pypardiso"):
-        direct = ["pardiso", "colamd"]
-    needed, there = estimate_memory(n, nnz, dim), _memory()
-    too_large = needed > 0.8 * there
-    multigrid = "amg" if jax.default_backend() == "cpu" else "device amg"
-    iterative = [multigrid] if installed("pyamg") else ["ilu"]
-    bordered = points is not None and bool(np.isnan(points).any())
-    if solver == "auto" and elliptic and not bordered:
-        if too_large or (n >= ITERATIVE_MIN.get(dim, n + 1) and iterative == [multigrid]):
-            solver = "iterative"
-        elif n >= MIXED_MIN and direct[0] == "nested dissection":
-            solver = "mixed"
-    if solver == "iterative":
-        return iterative if too_large else iterative + direct
-    if solver == "mixed" and points is not None and n > DENSE_MAX and 0.7 * needed <= 0.8 * there:
-        return ["float32 factors"] if too_large else ["float32 factors", *direct]
-    if too_large:
-        raise SolveError(
-            f"the direct solver would need about {needed / 1e9:.1f} GB for {n} unknowns, of {there / 1e9:.1f} GB of "
-            'memory; use solver="iterative", fewer particles or a lower order'
-        )
-    return direct
-
-
-@cache
-def _memory() -> float:
-    """Bytes of memory that the machine, or the container, has; infinite where it cannot be known."""
-    sizes = [float("inf")]
-    try:
-        sizes.append(float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")))
-    except (AttributeError, ValueError, OSError):
-        pass
-    try:
-        with open("/sys/fs/cgroup/memory.max") as limit:
-            sizes.append(float(limit.read()))
-    except (OSError, ValueError):  # no such limit, or "max"
-        pass
-    return min(sizes)
-
+        return _largest(self._in_callers_order(near_null_vector(backend.apply, self.n)))
 
 def _scales(
     data: np.ndarray, rows: np.ndarray, cols: np.ndarray, n: int, columns: bool
@@ -417,73 +325,10 @@ def _scales(
     return row_scale, col_scale
 
 
-def condition_estimate(factor: Factor) -> float:
-    """Condition number in the 1-norm, of the matrix with rows and columns scaled to about one.
-
-    A lower bound that is rarely off by more than 3; it costs a handful of solves. The scaling takes
-    out the units of equations and unknowns, so the number says how many digits are lost in a
-    solve, whatever they are.
-
-    Source: W. Hager, Condition estimates, SIAM J. Sci. Stat. Comput. 5 (1984), with the alternating
-    vector of N. Higham, ACM Trans. Math. Softw. 14 (1988).
-
-    Example:
-      >>> import numpy as np
-      >>> index = np.arange(2)
-      >>> condition_estimate(Factor(np.array([1.0, 2.0**-20]), index, index, 2))
-      1.0
-    """
-    n, apply = factor.n, factor._lu.apply
-    if factor._backends[0] in ITERATIVE:  # two digits of the number are enough
-        apply = partial(apply, tolerance=1e-6)
-    if not n:
-        return 1.0
-    x = np.full((n, 1), 1.0 / n)
-    best = 0.0
-    for _ in range(5):
-        y = apply(x, False)
-        size = float(abs(y).sum())
-        if not np.isfinite(size):
-            return float("inf")
-        if size <= best:
-            break
-        best = size
-        z = apply(np.where(y < 0, -1.0, 1.0), True)
-        j = int(abs(z).argmax())
-        if abs(z[j, 0]) <= abs(z[:, 0] @ x[:, 0]):
-            break
-        x = np.zeros((n, 1))
-        x[j] = 1.0
-    ramp = np.arange(n) / max(n - 1, 1)
-    alternating = (np.where(np.arange(n) % 2, -1.0, 1.0) * (1.0 + ramp))[:, None]
-    other = 2.0 * float(abs(apply(alternating, False)).sum()) / (3.0 * n)
-    return factor._norms[True] * max(best, other)
-
-
-def near_null_vector(factor: Factor, original: bool = False) -> np.ndarray:
-    """Unit vector (n,) the scaled matrix maps nearest to zero, by a few inverse iterations.
-
-    Its largest entries name the unknowns a (nearly) singular matrix leaves undetermined. The
-    numbering is the factor's own, the order of elimination, or the caller's with `original=True`.
-
-    Example:
-      >>> import numpy as np
-      >>> f = Factor(np.array([1, 1, 1, 1, 1.001]), [0, 1, 1, 2, 2], [0, 1, 2, 1, 2], 3)
-      >>> np.round(abs(near_null_vector(f, original=True)), 3).tolist()
-      [0.0, 0.707, 0.707]
-    """
-    vector = _inverse_iteration(factor._lu, factor.n)
-    if original and factor.order is not None:
-        out = np.empty_like(vector)
-        out[factor.order] = vector
-        return out
-    return vector
-
-
-def _inverse_iteration(backend: Any, n: int, steps: int = 3) -> np.ndarray:
-    """Right singular vector of the smallest singular value: powers of (A^T A)^-1."""
-    v = np.random.default_rng(1).standard_normal((n, 1))
-    for _ in range(steps):
-        w = backend.apply(v / np.linalg.norm(v), True)
-        v = backend.apply(w / np.linalg.norm(w), False)
-    return v[:, 0] / np.linalg.norm(v)
+def _largest(vector: np.ndarray) -> list[int]:
+    """The places of the largest entries, the largest first; none where one is not finite."""
+    size = abs(vector)
+    if not np.isfinite(size).all() or not size.any():
+        return []
+    worst = np.argsort(-size, kind="stable")
+    return worst[size[worst] >= 0.1 * size.max()].tolist()

@@ -256,7 +256,7 @@ class Run:
         if self.nums is None:
             raise ValueError("condition_numbers: the solve failed before it had a system; see diagnose()")
         assert self.factor is not None
-        whole = linsolve.condition_estimate(self.factor)
+        whole = self.factor.condition()
         return health.condition_numbers(self.disc, self.nums), float(whole)
 
     def flags(self, estimated: Callable[[], float]) -> list[str]:

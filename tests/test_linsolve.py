@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jsmitsm import backends, factorcache, linsolve, sparse
+from jsmitsm import backends, choice, factorcache, linsolve, sparse
 from jsmitsm.errors import SolveError
 from jsmitsm.linsolve import SingularMatrix, factor, factorisations, solve
 from jsmitsm.ordering import nested_dissection
@@ -410,8 +410,8 @@ def test_condition_and_null_vector():
     f = factor(*weak, 400, points)
     scaled = f.matrix.toarray()
     exact = np.linalg.cond(scaled, 1)
-    assert exact / 10 < linsolve.condition_estimate(f) <= exact * 1.01
-    null = linsolve.near_null_vector(f, original=True)
+    assert exact / 10 < f.condition() <= exact * 1.01
+    null = f.near_null_vector()
     np.testing.assert_allclose(abs(null * f.col_scale) / abs(null * f.col_scale).max(), 1.0, rtol=1e-6)
 
 
@@ -438,19 +438,19 @@ def test_bad_input(change, message):
 
 def test_without_pyamg(monkeypatch):
     data, rows, cols, points = grid(20)
-    monkeypatch.setattr(sparse, "installed", lambda _: False)
+    monkeypatch.setattr(choice, "installed", lambda _: False)
     info = {}
     x = solve(data, rows, cols, np.ones(400), n=400, points=points, solver="iterative", info=info)
     assert info["backend"] == "ilu" and 0 < info["iterations"] < 100
     np.testing.assert_allclose(full(data, rows, cols, 400) @ x, 1.0, atol=1e-12)
-    monkeypatch.setattr(sparse, "ITERATIVE_MIN", {2: 350})
-    assert sparse.choose_backends(400, 2000, points, "auto", True)[0] == "nested dissection"
+    monkeypatch.setattr(choice, "ITERATIVE_MIN", {2: 350})
+    assert choice.choose_backends(400, 2000, points, "auto", True)[0] == "nested dissection"
 
 
 def test_auto_takes_multigrid_for_large_elliptic_problems_only(monkeypatch):
-    monkeypatch.setattr(sparse, "ITERATIVE_MIN", {2: 350})
+    monkeypatch.setattr(choice, "ITERATIVE_MIN", {2: 350})
     points = grid(20)[3]
-    first = lambda points, elliptic: sparse.choose_backends(400, 2000, points, "auto", elliptic)[0]  # noqa: E731
+    first = lambda points, elliptic: choice.choose_backends(400, 2000, points, "auto", elliptic)[0]  # noqa: E731
     assert first(points, True) == "amg" and first(points, False) == "nested dissection"
     bordered = np.where(np.arange(400)[:, None] == 399, np.nan, points)
     assert first(bordered, True) == "nested dissection"
@@ -458,8 +458,8 @@ def test_auto_takes_multigrid_for_large_elliptic_problems_only(monkeypatch):
 
 def test_pardiso_where_installed(monkeypatch):
     pytest.importorskip("pypardiso")
-    monkeypatch.setattr(sparse, "PARDISO_MIN", {2: 350})
-    monkeypatch.setattr(sparse, "cores", lambda: 2)
+    monkeypatch.setattr(choice, "PARDISO_MIN", {2: 350})
+    monkeypatch.setattr(choice, "cores", lambda: 2)
     data, rows, cols, points = grid(20)
     data = data * (1 + 0.1 * np.sin(np.arange(len(data))))  # not symmetric
     f = sparse.Factor(data, rows, cols, 400, points, "sparse")
@@ -527,19 +527,18 @@ def test_refinement_reaches_roundoff():
 def test_what_does_not_fit_in_memory_is_refused(monkeypatch):
     """By estimate, before the factors are allocated; iteration, which needs little, stays allowed."""
     import jsmitsm as js
-    from jsmitsm import sparse
 
     cloud = js.rectangle((0, 0), (1, 1), (25, 25), jitter=0.2)
     sides = {side: js.dirichlet(lambda x: x[0]) for side in ("left", "right", "bottom", "top")}
     problem = js.Problem(lambda u, x: js.laplacian(u)(x), sides)
     js.solve(problem, cloud, solver="sparse")
     linsolve.clear_cache()
-    monkeypatch.setattr(sparse, "_memory", lambda: 5e7)
-    monkeypatch.setattr(sparse, "estimate_memory", lambda *_: 10**8)  # of the factors; the rows fit
+    monkeypatch.setattr(choice, "_memory", lambda: 5e7)
+    monkeypatch.setattr(choice, "estimate_memory", lambda *_: 10**8)  # of the factors; the rows fit
     with pytest.raises(js.SolveError, match=r'about 0\.1 GB for 529 unknowns.*solver="iterative"'):
         js.solve(problem, cloud, solver="sparse")
     assert js.solve(problem, cloud, solver="iterative").converged
-    monkeypatch.setattr(sparse, "_memory", lambda: 1e5)
+    monkeypatch.setattr(choice, "_memory", lambda: 1e5)
     with pytest.raises(js.SolveError, match="the rows and the matrix would need about .* fewer particles"):
         js.solve(problem, cloud, solver="iterative")
 
@@ -548,9 +547,9 @@ def test_memory_estimate():
     """Within a factor of two of the measured factor (8 bytes an entry and the row numbers)."""
     data, rows, cols, points = grid(60)
     entries = factor(data, rows, cols, 3600, points, "sparse").info["factor_entries"]
-    estimate = linsolve.estimate_memory(3600, 5 * 3600, 2)
+    estimate = choice.estimate_memory(3600, 5 * 3600, 2)
     assert 6 * entries < estimate < 40 * entries
-    assert linsolve.estimate_memory(10**5, 2 * 10**6, 2) < linsolve.estimate_memory(10**5, 2 * 10**6, 3)
+    assert choice.estimate_memory(10**5, 2 * 10**6, 2) < choice.estimate_memory(10**5, 2 * 10**6, 3)
 
 
 def test_jit_does_not_hang_on_one_core():
