@@ -15,9 +15,10 @@ from jsmitsm.globalsystem import (
     wave_number,
     with_held,
 )
-from jsmitsm.layout import Class, Discretization, default_size, discretize, scheme_size, sorted_classes, table
+from jsmitsm.layout import Class, Discretization, discretize, sorted_classes, table
 from jsmitsm.numbers import Numbers, numbers
 from jsmitsm.rows import all_coefficients, all_rows, class_moment_matrices, class_rows, shared_elimination
+from jsmitsm.supports import default_size, scheme_size
 
 __all__ = [
     "Class",

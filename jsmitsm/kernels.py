@@ -9,6 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jsmitsm.tracers import is_traced
+
 # A particle that sits on the edge of a support belongs to it; rounding must not decide that.
 EDGE = 1.0 + 1e-9
 
@@ -63,6 +65,12 @@ class Kernel:
     def weight(self, r: Any) -> Any:
         """The weight at the scaled distance ``r`` (any shape), zero outside the support."""
         return jnp.where(r <= self.d * EDGE, self.profile(r), 0.0)
+
+    @property
+    def length(self) -> Any:
+        """The length by which offsets are divided, of the size of the support: a scalar or (N,), like ``h``."""
+        xp = jnp if is_traced(self.h, self.d) else np
+        return self.h * xp.minimum(self.d, 2.0)
 
     def at(self, i: Any) -> Kernel:
         """The kernel of particle ``i``: its own smoothing length where there is one per particle."""
@@ -136,6 +144,11 @@ class Gaussian(_Named):
 
     def profile(self, r: Any) -> Any:
         return jnp.exp(-(r**2))
+
+
+def fitted(farthest: Any) -> Gaussian:
+    """What stands for a kernel where none is given: it has fallen to exp(-4) at the farthest neighbour."""
+    return Gaussian.tree_unflatten(None, (farthest / 2.0, 2.0, None))
 
 
 @jax.tree_util.register_pytree_node_class

@@ -1,4 +1,4 @@
-"""From a problem and a cloud to numbers: classes of particles, their operands, the global system."""
+"""What is static about a problem on a cloud: conditions, methods and classes of particles, decided once on the host."""
 
 from __future__ import annotations
 
@@ -6,24 +6,19 @@ import inspect
 from dataclasses import dataclass, replace
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm.boundary import Group, group_conditions, in_words
 from jsmitsm.clouds import Cloud
-from jsmitsm.kernels import EDGE, Constant, Gaussian, Kernel
+from jsmitsm.kernels import Constant, Kernel
 from jsmitsm.moments import Scheme
-from jsmitsm.neighbours import Stencils, evenly_spaced, in_line, jumps, nearest, replaced, within
+from jsmitsm.neighbours import Stencils
 from jsmitsm.periodic import Images, periodic_images
 from jsmitsm.problem import Problem
 from jsmitsm.recursion import Recursion, free_indices, recursion
+from jsmitsm.supports import check_supports, cut_off, default_kernel, find_stencils
 from jsmitsm.trace import Traced, trace
-from jsmitsm.tracers import concrete, is_traced
-
-# Neighbours for every free coefficient, by the order of the expansions, where the particles are evenly spaced.
-_EVEN_RATIO = {4: 1.5, 5: 1.5, 6: 1.5, 7: 1.65, 8: 1.65}
-# Particles whose given stencils are compared with their supports, at the most.
-_LOOKED_AT = 500
+from jsmitsm.tracers import is_traced
 
 
 @dataclass
@@ -136,13 +131,15 @@ def discretize(
     elif len(stencils) != len(cloud):
         raise ValueError(f"stencils: built for {len(stencils)} particles, the cloud has {len(cloud)}; build them again")
     if kernel is None and method in ("I", "II"):
-        kernel = _default_kernel(cloud, stencils)
+        kernel = default_kernel(cloud.points, np.arange(len(cloud)), stencils.indices)
     disc = Discretization(
         cloud, kernel, stencils, traced, rec, groups, scheme, [], held, partner, images, n_own, given_stencils
     )
-    _check_supports(disc)
-    disc.cut_off = _cut_off(disc)
-    disc.classes = sorted_classes(disc, np.flatnonzero(~held.all(axis=1)), stencils)
+    if given_stencils or kernel is not None:
+        check_supports(scheme, stencils, kernel, disc.points, n_own, disc.active)
+    if given_stencils and kernel is not None:
+        disc.cut_off = cut_off(stencils, kernel, disc.points, disc.active)
+    disc.classes = sorted_classes(disc, disc.active, stencils)
     return disc
 
 
@@ -234,50 +231,6 @@ def _traced(problem: Problem, dim: int) -> Traced:
                          "equation") from error  # fmt: skip
 
 
-def _check_supports(disc: Discretization) -> None:
-    """Every moment system needs as many neighbours as it has unknowns."""
-    scheme, near = disc.scheme, disc.stencils.indices
-    if is_traced(near, disc.kernel, disc.points) or (disc.kernel is None and not disc.given_stencils):
-        return
-    near, points = np.asarray(near), np.asarray(disc.points)
-    inside = near >= 0
-    if disc.kernel is not None:
-        offset = points[np.maximum(near, 0)] - points[: len(near), None]
-        reach = np.broadcast_to(np.asarray(disc.kernel.h) * np.asarray(disc.kernel.d), (len(near),))
-        inside &= np.linalg.norm(offset, axis=2) <= reach[:, None] * EDGE
-    counts = inside.sum(axis=1) - (scheme.method != "SSPH")
-    # I and II widen the supports of their first stage themselves.
-    needed = np.full(len(near), 2 if scheme.method in ("I", "II") else scheme_size(scheme))
-    needed -= np.where(disc.n_own > 0, disc.n_own, 0) // scheme.rec.fields
-    few = np.flatnonzero((counts < needed) & ~disc.held.all(axis=1))
-    if len(few):
-        i = few[0]
-        what = "stencils" if disc.kernel is None else "kernel"
-        raise ValueError(
-            f"{what}: {len(few)} particle(s) have too few neighbours, e.g. particle {i} has {counts[i]} of at least "
-            f"{needed[i]} that method {scheme.method} of order {scheme.rec.order} needs; choose larger supports "
-            "(increase h, d, size or radius) or a lower order"
-        )
-
-
-def _cut_off(disc: Discretization) -> tuple[int, ...]:
-    """Particles whose kernel would see more particles than their given stencil holds; none where that is traced.
-
-    Of many doubtful ones some are looked at: a search for all would cost as much as the stencils did.
-    """
-    radius, near = disc.stencils.radius, disc.stencils.indices
-    if not disc.given_stencils or disc.kernel is None or radius is None or is_traced(disc.kernel, disc.points, near):
-        return ()
-    reach = np.broadcast_to(np.asarray(disc.kernel.h) * np.asarray(disc.kernel.d), (len(near),)) * EDGE
-    doubtful = np.flatnonzero((reach > np.asarray(radius) * EDGE) & ~disc.held.all(axis=1))
-    if not len(doubtful):
-        return ()
-    doubtful = doubtful[:: -(-len(doubtful) // _LOOKED_AT)]
-    within_reach = within(np.asarray(disc.points), reach[doubtful], doubtful).indices >= 0
-    held = (np.asarray(near)[doubtful] >= 0).sum(axis=1)
-    return tuple(int(i) for i in doubtful[within_reach.sum(axis=1) > held])
-
-
 def _check_operator(traced: Traced, problem: Problem, order: int) -> None:
     if traced.n_equations != problem.fields:
         raise ValueError(
@@ -316,70 +269,3 @@ def _scheme(method: str, rec: Recursion, traced: Traced, problem: Problem, cloud
             )
         free = free[:basis_terms]
     return Scheme(method, rec, tuple(map(int, free)), tuple(map(int, dependent)))
-
-
-def scheme_size(scheme: Scheme) -> int:
-    """Free coefficients per field: how many neighbours a fit needs at the least."""
-    rec = scheme.rec
-    if scheme.method == "SSPH":
-        return rec.size
-    if scheme.free:
-        return len(scheme.free)
-    return -(-(rec.fields * rec.size - rec.n_rows) // rec.fields)
-
-
-def default_size(scheme: Scheme, even: bool = False) -> int:
-    """Neighbours, the particle itself counted, that make a good fit.
-
-    even: the particles keep their distance from one another. There smaller stencils of method S have errors two to
-    three times smaller; elsewhere, and at high orders near boundaries, too many of them would be weak.
-    """
-    free, rec = scheme_size(scheme), scheme.rec
-    if rec.dim == 1 and rec.fields == 1:
-        return min(2 * free + 2, 5)
-    ratio = _EVEN_RATIO.get(rec.order, 2.0) if even else 2.0
-    return round(ratio * free) + 2
-
-
-def find_stencils(
-    cloud: Cloud, kernel: Kernel | None, scheme: Scheme, images: Images, conditioned: np.ndarray
-) -> Stencils:
-    """Neighbours from the kernel's support, or as many of the nearest as the method needs without a kernel.
-
-    conditioned: the particles with conditions of their own, one-sided all of them.
-    """
-    if is_traced(cloud.points) or is_traced(kernel):
-        what = "kernel's h or d" if is_traced(kernel) else "points"
-        raise ValueError(
-            f"stencils: the {what} is traced by a JAX transform, and neighbours are found on the host; "
-            "build stencils = js.stencils(cloud, radius=...) before the transform and pass stencils=stencils to solve"
-        )
-    points = images.searched(np.asarray(cloud.points))
-    which = np.arange(len(cloud)) if len(images.owner) else None
-    if kernel is None:
-        needed = scheme_size(scheme)
-        if len(points) < needed + 1:
-            raise ValueError(
-                f"cloud: {len(points)} particles are too few for this order, which needs at least {needed + 1} "
-                "in every stencil; lower the order or add particles"
-            )
-        if cloud.dim == 1:
-            normals = None if len(images.owner) else concrete(cloud.normals)
-            return in_line(points, min(default_size(scheme), len(points)), which, normals)
-        size = min(default_size(scheme, scheme.method == "S" and evenly_spaced(points)), len(points))
-        found, full = nearest(points, size, which), min(default_size(scheme), len(points))
-        if size == full:
-            return found
-        wide = jumps(found.radius, images.owners(found.indices))
-        if cloud.dim == 3:  # there a Neumann side with small stencils has an error ten times that of the rest
-            wide = np.union1d(wide, conditioned)
-        return replaced(found, wide, nearest(points, full, wide)) if len(wide) else found
-    return within(points, np.asarray(kernel.d) * np.asarray(kernel.h), which)
-
-
-def _default_kernel(cloud: Cloud, stencils: Stencils) -> Kernel:
-    """A Gauss function per particle that has fallen to exp(-4) at its farthest neighbour."""
-    near, points = stencils.indices, cloud.points
-    xp = jnp if is_traced(near, points) else np
-    square = xp.sum((points[xp.maximum(near, 0)] - points[:, None]) ** 2, axis=2)
-    return Gaussian(xp.sqrt(xp.max(xp.where(near >= 0, square, 0.0), axis=1)) / 2.0, 2.0)

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jsmitsm.kernels import EDGE, Gaussian, Kernel
+from jsmitsm.kernels import EDGE, Kernel, fitted
 from jsmitsm.polynomials import FEW, combinations, functionals, monomials, whitening
 from jsmitsm.recursion import Recursion, Slot, constraints, substitution
 from jsmitsm.smallsolve import general_inverse, gram_inverse, min_norm, null_space, safe_root, solve_gram
@@ -89,21 +89,15 @@ def support(points: Any, i: Any, neighbours: Any, kernel: Kernel | None) -> Supp
     square = jnp.sum(offset**2, axis=1)
     apart = square > 0
     distance = jnp.where(apart, jnp.sqrt(jnp.where(apart, square, 1.0)), 0.0)
-    own = kernel.at(i) if kernel is not None else _default_kernel(distance)
+    own = kernel.at(i) if kernel is not None else fitted(jnp.max(distance))
     inside = valid & (distance <= own.d * own.h * EDGE) if kernel is not None else valid
-    length = own.h * jnp.minimum(own.d, 2.0)
     weight = jnp.maximum(own.profile(distance / own.h), 0.0)
-    return Support(offset / length, jnp.where(inside, weight, 0.0), inside, length, own)
+    return Support(offset / own.length, jnp.where(inside, weight, 0.0), inside, own.length, own)
 
 
 def at_length(near: Support, length: Any) -> Support:
     """The same neighbours with their offsets scaled by another length."""
     return near._replace(offset=near.offset * (near.length / length), length=length)
-
-
-def _default_kernel(distance: Any) -> Kernel:
-    """A Gauss function that has fallen to exp(-4) at the farthest neighbour."""
-    return Gaussian.tree_unflatten(None, (jnp.max(distance) / 2.0, 2.0, None))
 
 
 # ------------------------------------------------------------ the methods

@@ -21,6 +21,7 @@ from jsmitsm.numbers import Numbers
 from jsmitsm.program import in_one_program
 from jsmitsm.progress import each, shown
 from jsmitsm.repeats import repeats
+from jsmitsm.supports import default_kernel
 from jsmitsm.threads import cores, side_by_side
 from jsmitsm.tracers import is_traced
 
@@ -60,13 +61,8 @@ def _eliminations(disc: Discretization, nums: Numbers, cls: Class) -> tuple[Elim
         return None
     if isinstance(nums.jac, jax.Array):
         return None
-    if kernel is None:
-        points = np.asarray(points)
-        offset = points[np.where(near >= 0, near, cls.ids[:, None])] - points[cls.ids][:, None]
-        length = np.sqrt((offset**2).sum(axis=2).max(axis=1))
-    else:
-        h = np.broadcast_to(np.asarray(kernel.h), (len(points),))[cls.ids]
-        length = h * np.minimum(np.asarray(kernel.d), 2.0)
+    own = default_kernel(points, cls.ids, near) if kernel is None else kernel.at(cls.ids)
+    length = np.broadcast_to(np.asarray(own.length), cls.ids.shape)
     if not (length > 0).all():
         return None
     steps, place = np.unique(np.rint(np.log(length) / np.log(_STEP)).astype(int), return_inverse=True)
