@@ -16,12 +16,26 @@ so that the gradient is exact *on* the boundary, where particles are put.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+
+from jsmitsm.combine import (
+    Sdf,
+    complement,
+    difference,
+    intersection,
+    rotate,
+    round,
+    scale,
+    shell,
+    smooth_union,
+    translate,
+    union,
+)
+from jsmitsm.vectors import corner_distance, known, norm, offset_from, positive, vector
 
 __all__ = [
     "ball",
@@ -50,8 +64,6 @@ __all__ = [
     "union",
 ]
 
-Sdf = Callable[[jax.Array], jax.Array]
-
 
 def ball(center: Any, radius: Any) -> Sdf:
     """The ball |x - center| < radius in any dimension, also called :func:`sphere`; ``center`` (D,), lengths in length
@@ -63,8 +75,8 @@ def ball(center: Any, radius: Any) -> Sdf:
     >>> float(js.sdf.ball((0, 0, 0), 2.0)(jnp.array([0.0, 3.0, 4.0])))
     3.0
     """
-    center, radius = _vector("center", center), _positive("radius", radius)
-    return lambda x: _norm(_from(x, center)) - radius
+    center, radius = vector("center", center), positive("radius", radius)
+    return lambda x: norm(offset_from(x, center)) - radius
 
 
 def circle(center: Any, radius: Any) -> Sdf:
@@ -74,7 +86,7 @@ def circle(center: Any, radius: Any) -> Sdf:
     >>> float(js.sdf.circle((0, 0), 1.0)(jnp.array([3.0, 4.0])))
     4.0
     """
-    return ball(_vector("center", center, 2), radius)
+    return ball(vector("center", center, 2), radius)
 
 
 disk = circle
@@ -90,12 +102,12 @@ def box(lo: Any, hi: Any) -> Sdf:
     >>> float(js.sdf.box((0, 0), (2, 2))(jnp.array([5.0, 6.0])))
     5.0
     """
-    lo = _vector("lo", lo)
-    hi = _vector("hi", hi, np.shape(lo)[0])
-    if _concrete(lo) and _concrete(hi) and not (hi > lo).all():
+    lo = vector("lo", lo)
+    hi = vector("hi", hi, np.shape(lo)[0])
+    if known(lo) and known(hi) and not (hi > lo).all():
         raise ValueError(f"hi: {hi} must be greater than lo = {lo} along every axis; swap the two corners")
     center, half = (lo + hi) / 2, (hi - lo) / 2
-    return lambda x: _corner_distance(jnp.abs(_from(x, center)) - half)
+    return lambda x: corner_distance(jnp.abs(offset_from(x, center)) - half)
 
 
 def rectangle(lo: Any, hi: Any) -> Sdf:
@@ -105,7 +117,7 @@ def rectangle(lo: Any, hi: Any) -> Sdf:
     >>> float(js.sdf.rectangle((0, 0), (2, 1))(jnp.array([1.0, 0.75])))
     -0.25
     """
-    return box(_vector("lo", lo, 2), _vector("hi", hi, 2))
+    return box(vector("lo", lo, 2), vector("hi", hi, 2))
 
 
 def interval(a: Any, b: Any) -> Sdf:
@@ -127,12 +139,12 @@ def half_space(point: Any, normal: Any) -> Sdf:
     >>> float(js.sdf.half_space((0, 0), (0, 2))(jnp.array([5.0, -3.0])))
     -3.0
     """
-    point = _vector("point", point)
-    normal = _vector("normal", normal, np.shape(point)[0])
-    if _concrete(normal) and not np.any(normal):
+    point = vector("point", point)
+    normal = vector("normal", normal, np.shape(point)[0])
+    if known(normal) and not np.any(normal):
         raise ValueError("normal: a zero vector came, a direction out of the half-space was expected")
     unit = normal / (jnp if isinstance(normal, jax.core.Tracer) else np).linalg.norm(normal)
-    return lambda x: jnp.dot(_from(x, point), unit)
+    return lambda x: jnp.dot(offset_from(x, point), unit)
 
 
 def ellipse(center: Any, semi_axes: Any) -> Sdf:
@@ -145,12 +157,12 @@ def ellipse(center: Any, semi_axes: Any) -> Sdf:
     >>> float(js.sdf.ellipse((0, 0), (2, 1))(jnp.array([2.0, 0.0])))
     0.0
     """
-    center = _vector("center", center)
-    axes = _positive("semi_axes", _vector("semi_axes", semi_axes, np.shape(center)[0]))
+    center = vector("center", center)
+    axes = positive("semi_axes", vector("semi_axes", semi_axes, np.shape(center)[0]))
 
     def sdf(x: jax.Array) -> jax.Array:
-        y = _from(x, center) / axes
-        radius, slope = _norm(y), _norm(y / axes)
+        y = offset_from(x, center) / axes
+        radius, slope = norm(y), norm(y / axes)
         # At the centre the ratio radius / slope has no limit; any value between the semi-axes serves.
         ratio = jnp.where(slope > 0, radius / jnp.where(slope > 0, slope, 1.0), jnp.min(axes))
         return (radius - 1.0) * ratio
@@ -170,12 +182,12 @@ def capsule(a: Any, b: Any, radius: Any) -> Sdf:
     >>> float(js.sdf.capsule((0, 0), (2, 0), 0.5)(jnp.array([1.0, 2.0])))
     1.5
     """
-    a, radius = _vector("a", a), _positive("radius", radius)
-    along = _vector("b", b, np.shape(a)[0]) - a
+    a, radius = vector("a", a), positive("radius", radius)
+    along = vector("b", b, np.shape(a)[0]) - a
 
     def sdf(x: jax.Array) -> jax.Array:
-        t = jnp.clip(jnp.dot(_from(x, a), along) / jnp.dot(along, along), 0.0, 1.0)
-        return _norm(x - a - t * along) - radius
+        t = jnp.clip(jnp.dot(offset_from(x, a), along) / jnp.dot(along, along), 0.0, 1.0)
+        return norm(x - a - t * along) - radius
 
     return sdf
 
@@ -189,15 +201,15 @@ def cylinder(a: Any, b: Any, radius: Any) -> Sdf:
     >>> float(js.sdf.cylinder((0, 0, 0), (0, 0, 2), 1.0)(jnp.array([0.0, 3.0, 1.0])))
     2.0
     """
-    a, radius = _vector("a", a, 3), _positive("radius", radius)
-    along = _vector("b", b, 3) - a
+    a, radius = vector("a", a, 3), positive("radius", radius)
+    along = vector("b", b, 3) - a
 
     def sdf(x: jax.Array) -> jax.Array:
-        length = _norm(along)
+        length = norm(along)
         axis = along / length
-        z = jnp.dot(_from(x, a), axis)
-        across = _norm(x - a - z * axis)
-        return _corner_distance(jnp.stack([across - radius, jnp.abs(z - length / 2) - length / 2]))
+        z = jnp.dot(offset_from(x, a), axis)
+        across = norm(x - a - z * axis)
+        return corner_distance(jnp.stack([across - radius, jnp.abs(z - length / 2) - length / 2]))
 
     return sdf
 
@@ -211,14 +223,14 @@ def torus(center: Any, major: Any, minor: Any, axis: Any = (0.0, 0.0, 1.0)) -> S
     >>> float(js.sdf.torus((0, 0, 0), 2.0, 0.5)(jnp.array([2.0, 0.0, 1.5])))
     1.0
     """
-    center, axis = _vector("center", center, 3), _vector("axis", axis, 3)
-    major, minor = _positive("major", major), _positive("minor", minor)
+    center, axis = vector("center", center, 3), vector("axis", axis, 3)
+    major, minor = positive("major", major), positive("minor", minor)
 
     def sdf(x: jax.Array) -> jax.Array:
-        unit = axis / _norm(axis)
-        z = jnp.dot(_from(x, center), unit)
-        across = _norm(x - center - z * unit)
-        return _norm(jnp.stack([across - major, z])) - minor
+        unit = axis / norm(axis)
+        z = jnp.dot(offset_from(x, center), unit)
+        across = norm(x - center - z * unit)
+        return norm(jnp.stack([across - major, z])) - minor
 
     return sdf
 
@@ -255,222 +267,14 @@ def polygon(vertices: Any) -> Sdf:
         flat = jnp.dot(offset[nearest], normal[nearest])
         vertex = jnp.where(t > 0.5, (nearest + 1) % len(begin), nearest)
         away = x - begin[vertex]
-        distance = _norm(away)
+        distance = norm(away)
         above = begin[:, 1] > x[1]
         crossed = (above != (end[:, 1] > x[1])) & (
             x[0] - begin[:, 0] < edge[:, 0] * (x[1] - begin[:, 1]) / jnp.where(edge[:, 1] == 0, 1.0, edge[:, 1])
         )
         sign = jnp.where(jnp.sum(crossed) % 2 == 1, -1.0, 1.0)
-        bisector = corner[vertex] / jnp.maximum(_norm(corner[vertex]), 1e-300)
+        bisector = corner[vertex] / jnp.maximum(norm(corner[vertex]), 1e-300)
         pointed = jnp.where(distance > 0, sign * distance, jnp.dot(away, bisector))
         return jnp.where((t > 0) & (t < 1), flat, pointed)
 
     return sdf
-
-
-def union(*shapes: Sdf) -> Sdf:
-    """What lies in any of the shapes (the smallest distance; exact outside, a bound inside). ValueError without any.
-
-    >>> import jax.numpy as jnp, jsmitsm as js
-    >>> float(js.sdf.union(js.sdf.circle((0, 0), 1.0), js.sdf.circle((3, 0), 1.0))(jnp.array([3.0, 0.0])))
-    -1.0
-    """
-    return _combine(jnp.minimum, shapes)
-
-
-def intersection(*shapes: Sdf) -> Sdf:
-    """What lies in all of the shapes (the largest distance; exact inside, a bound outside). ValueError without any.
-
-    >>> import jax.numpy as jnp, jsmitsm as js
-    >>> float(js.sdf.intersection(js.sdf.circle((0, 0), 1.0), js.sdf.circle((1, 0), 1.0))(jnp.array([0.5, 0.0])))
-    -0.5
-    """
-    return _combine(jnp.maximum, shapes)
-
-
-def difference(shape: Sdf, *holes: Sdf) -> Sdf:
-    """What lies in ``shape`` and in none of the ``holes``. ValueError for what is no function.
-
-    >>> import jax.numpy as jnp, jsmitsm as js
-    >>> float(js.sdf.difference(js.sdf.circle((0, 0), 2.0), js.sdf.circle((0, 0), 1.0))(jnp.array([1.5, 0.0])))
-    -0.5
-    """
-    return intersection(shape, *map(complement, holes))
-
-
-def complement(shape: Sdf) -> Sdf:
-    """What lies outside of ``shape``.
-
-    >>> import jax.numpy as jnp, jsmitsm as js
-    >>> float(js.sdf.complement(js.sdf.circle((0, 0), 1.0))(jnp.array([0.0, 0.0])))
-    1.0
-    """
-    return lambda x: -shape(x)
-
-
-def smooth_union(first: Sdf, second: Sdf, radius: Any) -> Sdf:
-    """The union with its seam filled over a width ``radius`` (length units); quadratic blend, C1.
-
-    Raises ValueError for a width that is not positive.
-
-    >>> import jax.numpy as jnp, jsmitsm as js
-    >>> float(js.sdf.smooth_union(js.sdf.circle((-1, 0), 1.0), js.sdf.circle((1, 0), 1.0), 0.5)(jnp.zeros(2)))
-    -0.125
-    """
-    radius = _positive("radius", radius)
-
-    def sdf(x: jax.Array) -> jax.Array:
-        a, b = first(x), second(x)
-        overlap = jnp.maximum(radius - jnp.abs(a - b), 0.0)
-        return jnp.minimum(a, b) - overlap**2 / (4.0 * radius)
-
-    return sdf
-
-
-def translate(shape: Sdf, offset: Any) -> Sdf:
-    """The shape moved by ``offset`` (D,). Raises ValueError for what is no vector.
-
-    >>> import jax.numpy as jnp, jsmitsm as js
-    >>> float(js.sdf.translate(js.sdf.circle((0, 0), 1.0), (3, 0))(jnp.array([3.0, 0.0])))
-    -1.0
-    """
-    offset = _vector("offset", offset)
-    return lambda x: shape(_from(x, offset))
-
-
-def scale(shape: Sdf, factor: Any, center: Any = None) -> Sdf:
-    """The shape enlarged by ``factor`` > 0 about ``center`` (the origin by default). ValueError for another factor.
-
-    >>> import jax.numpy as jnp, jsmitsm as js
-    >>> float(js.sdf.scale(js.sdf.circle((0, 0), 1.0), 3.0)(jnp.zeros(2)))
-    -3.0
-    """
-    factor = _positive("factor", factor)
-    middle = 0.0 if center is None else _vector("center", center)
-    return lambda x: factor * shape(middle + (x - middle) / factor)
-
-
-def rotate(shape: Sdf, angle: Any, center: Any = None, axis: Any = None) -> Sdf:
-    """The shape turned by ``angle`` (radians, counter-clockwise) about ``center`` (the origin by default).
-
-    In 3D about the line through ``center`` along ``axis`` (3,), by the right-hand rule.
-    Raises ValueError, when called, for a 3D point without an axis and for a 2D one with it.
-
-    >>> import jax.numpy as jnp, jsmitsm as js
-    >>> upright = js.sdf.rotate(js.sdf.rectangle((0, 0), (2, 1)), jnp.pi / 2)
-    >>> print(f"{upright(jnp.array([-0.5, 1.0])):.3f}")
-    -0.500
-    """
-    middle = 0.0 if center is None else _vector("center", center)
-    direction = None if axis is None else _vector("axis", axis, 3)
-
-    def sdf(x: jax.Array) -> jax.Array:
-        if x.shape[0] == 1 or (x.shape[0] == 3) != (direction is not None):
-            raise ValueError(
-                f"axis: {axis} came with a point in {x.shape[0]}D; 3D needs an axis (3,), 2D takes none, 1D has none"
-            )
-        c, s, y = jnp.cos(angle), jnp.sin(angle), x - middle
-        if direction is None:
-            turned = jnp.stack([c * y[0] + s * y[1], c * y[1] - s * y[0]])
-        else:
-            unit = direction / _norm(direction)  # Rodrigues' formula with the opposite angle
-            turned = c * y - s * jnp.cross(unit, y) + (1.0 - c) * jnp.dot(unit, y) * unit
-        return shape(middle + turned)
-
-    return sdf
-
-
-def round(shape: Sdf, radius: Any) -> Sdf:
-    """The shape grown by ``radius``, its convex corners rounded with it (exact distances only).
-
-    To keep the size, shrink the shape first: ``round(box(lo + r, hi - r), r)``.
-    Raises ValueError for a radius that is not positive.
-
-    >>> import jax.numpy as jnp, jsmitsm as js
-    >>> float(js.sdf.round(js.sdf.rectangle((0, 0), (2, 1)), 0.25)(jnp.array([1.0, 2.0])))
-    0.75
-    """
-    radius = _positive("radius", radius)
-    return lambda x: shape(x) - radius
-
-
-def shell(shape: Sdf, thickness: Any) -> Sdf:
-    """The wall of the given thickness with the boundary of ``shape`` in its middle.
-
-    Raises ValueError for a thickness that is not positive.
-
-    >>> import jax.numpy as jnp, jsmitsm as js
-    >>> float(js.sdf.shell(js.sdf.circle((0, 0), 1.0), 0.5)(jnp.array([1.0, 0.0])))
-    -0.25
-    """
-    half = _positive("thickness", thickness) / 2
-    return lambda x: jnp.abs(shape(x)) - half
-
-
-def _combine(pick: Callable[[jax.Array, jax.Array], jax.Array], shapes: Sequence[Sdf]) -> Sdf:
-    """Fold the values of all shapes with min or max."""
-    if not shapes or not all(map(callable, shapes)):
-        raise ValueError(f"shapes: expected one or more functions x -> scalar, got {shapes!r}; pass them one by one")
-
-    def sdf(x: jax.Array) -> jax.Array:
-        value = shapes[0](x)
-        for shape in shapes[1:]:
-            value = pick(value, shape(x))
-        return value
-
-    return sdf
-
-
-def _from(x: jax.Array, origin: Any) -> jax.Array:
-    """x - origin; a point of another dimension would be broadcast to a shape that nobody meant."""
-    if jnp.shape(x) != jnp.shape(origin):
-        raise ValueError(
-            f"sdf: a shape in {len(origin)}D was asked at a point of shape {jnp.shape(x)}; bounds and points must have "
-            "its dimension"
-        )
-    return x - origin
-
-
-def _norm(v: jax.Array) -> jax.Array:
-    """Euclidean norm whose gradient at zero is zero instead of NaN."""
-    square = jnp.sum(v * v)
-    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
-
-
-def _corner_distance(q: jax.Array) -> jax.Array:
-    """Distance to the orthant q < 0; on a face the gradient is that of the face, at a corner the mean."""
-    return jnp.where(jnp.any(q > 0), _norm(jnp.where(q > 0, q, 0.0)), jnp.max(q))
-
-
-def _concrete(value: Any) -> bool:
-    return isinstance(value, (np.ndarray, float))
-
-
-def _vector(name: str, value: Any, dim: int | None = None) -> Any:
-    """A (D,) float64 host array, so that nothing depends on the precision at the time of the call."""
-    if isinstance(value, jax.core.Tracer):
-        vector: Any = value
-    else:
-        try:
-            if any(isinstance(v, jax.core.Tracer) for v in value):
-                vector = jnp.stack([jnp.asarray(v) for v in value])
-            else:
-                vector = np.asarray(value, dtype=np.float64)
-        except (TypeError, ValueError):
-            raise ValueError(f"{name}: expected {dim or 'D'} numbers, got {value!r}") from None
-    if vector.ndim != 1 or (dim is not None and vector.shape != (dim,)) or vector.shape[0] not in (1, 2, 3):
-        expected = f"({dim},)" if dim else "(D,) with D = 1, 2 or 3"
-        raise ValueError(f"{name}: shape {vector.shape} came, {expected} was expected")
-    if _concrete(vector) and not np.isfinite(vector).all():
-        raise ValueError(f"{name}: expected finite numbers, got {value!r}")
-    return vector
-
-
-def _positive(name: str, value: Any) -> Any:
-    """A positive number (or vector of them); traced values pass unchecked."""
-    if isinstance(value, jax.core.Tracer):
-        return value
-    array = np.asarray(value, dtype=np.float64)
-    if not (np.isfinite(array).all() and (array > 0).all()):
-        raise ValueError(f"{name}: expected a positive finite length, got {value!r}")
-    return array if array.ndim else float(array)
