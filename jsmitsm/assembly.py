@@ -169,16 +169,16 @@ def coefficients(
 @_in_size_classes
 def blocks(
     scheme: Scheme, points: Any, kernel: Kernel | None, ids: Any, neighbours: Any, operands: Operands,
-    each: tuple[Any, Any], whole: tuple = (),
+    each: tuple = (), whole: tuple = (),
 ) -> Block:  # fmt: skip
-    """The least-squares blocks of the particles ``ids``; each: source (n, rows) and given (n, n_own)."""
+    """The least-squares blocks of the particles ``ids`` (n,) with ``neighbours`` (n, w); particle axis first."""
     TRACES["rows"] += 1
 
-    def particle(i, near_ids, jac, own, source, given):
+    def particle(i, near_ids, jac, own):
         near, solution, own, data, _ = _prepared(scheme, points, kernel, i, near_ids, operands, jac, own)
-        return moments.block(scheme, near, solution, own, data, source, given)
+        return moments.block(scheme, near, solution, own, data)
 
-    return _mapped(particle, ids, neighbours, operands, *each)
+    return _mapped(particle, ids, neighbours, operands)
 
 
 def _mapped(particle: Any, ids: Any, neighbours: Any, operands: Operands, *more: Any) -> Any:

@@ -1,21 +1,13 @@
 """The way from a problem and a cloud to a global system, in one namespace.
 
 ``layout`` decides what is static, ``numbers`` evaluates what may be traced, ``rows`` sets up the
-moment systems, ``globalsystem`` joins them.
+moment systems, ``globalsystem`` and ``leastsquares`` join them, ``character`` tells which of the two suits.
 """
 
-from jsmitsm.globalsystem import (
-    cell_peclet,
-    least_squares,
-    matrix,
-    mean_spacing,
-    misfit,
-    prefers_least_squares,
-    right_side,
-    wave_number,
-    with_held,
-)
+from jsmitsm.character import cell_peclet, mean_spacing, prefers_least_squares, wave_number
+from jsmitsm.globalsystem import matrix, right_side, with_held
 from jsmitsm.layout import Class, Discretization, discretize, sorted_classes, table
+from jsmitsm.leastsquares import least_squares, least_squares_right_side, misfit
 from jsmitsm.numbers import Numbers, numbers
 from jsmitsm.rows import all_coefficients, all_rows, class_moment_matrices, class_rows, shared_elimination
 from jsmitsm.supports import default_size, scheme_size
@@ -32,6 +24,7 @@ __all__ = [
     "default_size",
     "discretize",
     "least_squares",
+    "least_squares_right_side",
     "matrix",
     "mean_spacing",
     "misfit",

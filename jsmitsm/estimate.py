@@ -16,7 +16,7 @@ from jsmitsm.neighbours import Stencils
 from jsmitsm.problem import Problem
 from jsmitsm.progress import bar
 from jsmitsm.solution import Recipe, Solution
-from jsmitsm.solve import Fit, discretized
+from jsmitsm.solve import Fit, check, discretized
 from jsmitsm.system import Run
 from jsmitsm.taylor import HIGHEST, multi_indices
 from jsmitsm.tracers import concrete, is_traced
@@ -129,12 +129,13 @@ class Factorization:
     the values in the conditions changed, and makes anew what else did.
     """
 
-    def __init__(self, disc: Discretization, problem: Problem, solver: str):
-        self._disc, self._problem, self._solver = disc, problem, solver
-        self._run = Run(disc, problem, solver, True, disc.kernel is None, "loo")
+    def __init__(self, disc: Discretization, problem: Problem, solver: str, repair: bool, formulation: str):
+        self._disc, self._options = disc, (solver, repair, formulation)
+        self._run = Run(disc, problem, solver, True, repair, formulation)
         self._nums = dz.numbers(disc, problem)
-        self._classes, self._rows = self._run.local_rows(self._nums)
-        self._matrix = dz.matrix(disc, self._classes, self._rows)
+        self._parts: list[Any] = []  # of the least-squares form
+        data, rows, cols, self._right = self._run.assembled(self._nums, self._parts)
+        self._matrix = data, rows, cols
 
     @bar("solve")
     def solve(self, problem: Problem) -> Solution:
@@ -143,9 +144,9 @@ class Factorization:
         Raises ValueError for another kind of operator or conditions, SolveError as :func:`jsmitsm.solve` does.
         """
         old = self._disc
-        disc = discretized(
-            problem, old.cloud, old.scheme.method, old.rec.order, old.kernel, Stencils(dz.table(old), None)
-        )
+        method, order, kernel = old.scheme.method, old.rec.order, old.kernel
+        check(problem, old.cloud, method, order, kernel, None)
+        disc = dz.discretize(problem, old.cloud, method, order, kernel, Stencils(dz.table(old), None), old.basis_terms)
         if disc.scheme != old.scheme or not np.array_equal(disc.held, old.held):
             raise ValueError(
                 "problem: its operator or the kind of its conditions differs from the one that was factorised; "
@@ -154,20 +155,26 @@ class Factorization:
         nums = dz.numbers(disc, problem)
         same = _same(nums.jac, self._nums.jac) and _same(nums.own, self._nums.own) and _same(nums.data, self._nums.data)
         if not same or disc.scheme.method in ("I", "II"):
-            return Factorization(disc, problem, self._solver)._finish(problem, None)
-        return self._finish(problem, nums)
+            made = Factorization(disc, problem, *self._options)
+            return made._finish(problem, made._nums, made._right)
+        return self._finish(problem, nums, self._right_side(nums))
 
-    def _finish(self, problem: Problem, nums: Numbers | None) -> Solution:
-        nums = self._nums if nums is None else nums
+    def _right_side(self, nums: Numbers) -> Any:
+        if self._run.formulation == "lsq":
+            return dz.least_squares_right_side(self._disc, nums, self._parts)
+        assert self._run.rows is not None
+        return dz.right_side(self._disc, nums, *self._run.rows)
+
+    def _finish(self, problem: Problem, nums: Numbers, right: Any) -> Solution:
         disc = self._disc
         run = copy(self._run)  # the solution's own: what it says of itself must not change with the next
-        run.problem, run.messages = problem, list(self._run.messages)
-        x, good = run.solved(*self._matrix, dz.right_side(disc, nums, self._classes, self._rows))
+        run.problem, run.messages, run.against = problem, list(run.messages), list(run.against)
+        x, good = run.solved(*self._matrix, right)
         values = dz.with_held(disc, nums, x)
         traced = is_traced(values)
         if not traced:
-            run.rows, run.nums, run.values = (self._classes, self._rows), nums, np.asarray(values)
-        recipe = Recipe(disc.scheme.method, disc.rec.order, None, "loo", problem.fields)
+            run.nums, run.values = nums, np.asarray(values)
+        recipe = Recipe(disc.scheme.method, disc.rec.order, disc.basis_terms, run.formulation, problem.fields)
         fit = Fit(problem, disc.cloud, disc.kernel, dz.table(disc), None, recipe)
         fine = jnp.isfinite(values).all() if traced else good
         return Solution(values, disc.cloud, recipe, fit, fine, 1, run.stats(), report=None if traced else run)
@@ -188,14 +195,15 @@ def _same(x: Any, y: Any) -> bool:
 @bar("factorize")
 def factorize(
     problem: Problem, cloud: Cloud, *, method: str = "S", order: int = 4, kernel: Kernel | None = None,
-    stencils: Stencils | None = None, solver: str = "auto",
+    stencils: Stencils | None = None, basis_terms: int | None = None, formulation: str = "auto", solver: str = "auto",
 ) -> Factorization:  # fmt: skip
     """Prepare a linear problem for many right-hand sides.
 
     Returns an object whose ``solve(problem)`` reuses everything that a change of the source or of
     the values in the conditions leaves valid: neighbours, moment systems, ordering and factors.
 
-    ``method``, ``order``, ``kernel``, ``stencils`` and ``solver`` as for :func:`jsmitsm.solve`.
+    ``method``, ``order``, ``kernel``, ``stencils``, ``basis_terms``, ``formulation`` and ``solver`` as for
+    :func:`jsmitsm.solve`.
     Raises ValueError for a nonlinear problem: its matrix changes in every step.
 
     Examples
@@ -210,7 +218,7 @@ def factorize(
     >>> round(float(ready.solve(heated(8.0)).u[5]), 10)
     1.0
     """
-    disc = discretized(problem, cloud, method, order, kernel, stencils)
+    disc = discretized(problem, cloud, method, order, kernel, stencils, basis_terms, formulation, solver)
     if not disc.linear:
         raise ValueError("problem: it is nonlinear, so its matrix changes in every step; use js.solve")
-    return Factorization(disc, problem, solver)
+    return Factorization(disc, problem, solver, kernel is None and stencils is None, formulation)

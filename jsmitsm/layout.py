@@ -50,6 +50,7 @@ class Discretization:
     images: Images
     n_own: np.ndarray  # (N,) own conditions of each particle
     given_stencils: bool  # the user's: nothing outside them is looked at
+    basis_terms: int | None = None  # free coefficients kept, all of them if not given
     repeated: int = 0  # particles whose moment system was that of another
     cut_off: tuple[int, ...] = ()  # particles whose support reaches outside of the given stencil
     lengths: int = 0  # eliminations of a constant operator, where one for all is not enough
@@ -133,8 +134,9 @@ def discretize(
     if kernel is None and method in ("I", "II"):
         kernel = default_kernel(cloud.points, np.arange(len(cloud)), stencils.indices)
     disc = Discretization(
-        cloud, kernel, stencils, traced, rec, groups, scheme, [], held, partner, images, n_own, given_stencils
-    )
+        cloud, kernel, stencils, traced, rec, groups, scheme, [], held, partner, images, n_own, given_stencils,
+        basis_terms,
+    )  # fmt: skip
     if given_stencils or kernel is not None:
         check_supports(scheme, stencils, kernel, disc.points, n_own, disc.active)
     if given_stencils and kernel is not None:

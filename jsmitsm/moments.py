@@ -331,18 +331,21 @@ def _collocated(scheme, near, solution, own, data, tests):
 class Block(NamedTuple):
     """A particle's part of the least-squares form, sum_i |(I - A A^+) sqrt(W) (u - P U_part)|^2.
 
-    matrix (m, m) and load (m,) over the fit's data: values of the neighbours, the particle
-    itself first, then their conditions.
+    matrix (m, m) over the fit's data: values of the neighbours, the particle itself first, then their
+    conditions. right (m, rows + n_own): times the recursion's right-hand side, if the scheme is sourced,
+    and the values of the own conditions, it is the load of the data.
     """
 
     matrix: Any
-    load: Any
+    right: Any
 
 
-def block(scheme: Scheme, near: Support, solution: Elimination, own: Any, data: Any, source: Any, given: Any) -> Block:
+def block(scheme: Scheme, near: Support, solution: Elimination, own: Any, data: Any) -> Block:
     """The least-squares misfit of the particle's local fit as a quadratic form of its data."""
     system = local_system(scheme, near, solution, own, data, None, skip_self=False)
-    part = particular_part(scheme, solution, system, source, given)
+    n_source = scheme.rec.n_rows
+    each = jnp.eye(n_source + scheme.n_own)[0 if scheme.sourced else n_source :]
+    part = jax.vmap(partial(particular_part, scheme, solution, system))(each[:, :n_source], each[:, n_source:])
     root = safe_root(system.weight)
     a = root[:, None] * system.phi
     misfit = jnp.diag(system.weight) - root[:, None] * (a @ solve_gram(a, gram_inverse(a), a.T)) * root
@@ -350,7 +353,7 @@ def block(scheme: Scheme, near: Support, solution: Elimination, own: Any, data: 
     ns = near.weight.shape[0]
     power = near.length ** jnp.asarray(scheme.rec.weights, near.length.dtype)
     scale = jnp.concatenate([jnp.tile(power, ns), system.data_scale.reshape(-1)])
-    return Block(scale[:, None] * misfit * scale, scale * (misfit @ (system.values @ part)))
+    return Block(scale[:, None] * misfit * scale, scale[:, None] * (misfit @ (system.values @ part.T)))
 
 
 def particular_part(scheme: Scheme, solution: Elimination, system: System, source: Any, given: Any) -> Any:

@@ -114,12 +114,10 @@ def solve(
     True
     """
     start = time.perf_counter()
-    _check(problem, cloud, method, order, kernel, stencils, formulation, solver, u0, throw)
+    check(problem, cloud, method, order, kernel, stencils, formulation, solver, u0, throw)
     disc = dz.discretize(problem, cloud, method, order, kernel, stencils, basis_terms, sources=False)
     run = Run(disc, problem, solver, throw, kernel is None and stencils is None, formulation)
     run.seconds["set-up"] = time.perf_counter() - start
-    if formulation == "lsq" and method != "S":
-        raise ValueError(f'formulation: "lsq" is a form of method S, not of {method!r}; use method="S" or "loo"')
     if not disc.classes:
         raise ValueError("problem: every particle's value is held; nothing is left to solve for")
     if disc.linear:
@@ -137,14 +135,16 @@ def solve(
 
 def discretized(
     problem: Problem, cloud: Cloud, method: str = "S", order: int = 4, kernel: Kernel | None = None,
-    stencils: Stencils | None = None,
+    stencils: Stencils | None = None, basis_terms: int | None = None, formulation: str = "auto", solver: str = "auto",
 ) -> Discretization:  # fmt: skip
     """Checked arguments, discretised."""
-    _check(problem, cloud, method, order, kernel, stencils, "auto", "auto")
-    return dz.discretize(problem, cloud, method, order, kernel, stencils, None)
+    check(problem, cloud, method, order, kernel, stencils, formulation, solver)
+    return dz.discretize(problem, cloud, method, order, kernel, stencils, basis_terms)
 
 
-def _check(problem, cloud, method, order, kernel, stencils, formulation, solver, u0=None, throw=True) -> None:
+def check(
+    problem, cloud, method, order, kernel, stencils, formulation="auto", solver="auto", u0=None, throw=True
+) -> None:
     """Arguments of :func:`solve` that can be judged before any work."""
     for value, kind, name in ((problem, Problem, "problem"), (cloud, Cloud, "cloud")):
         if not isinstance(value, kind):
@@ -160,6 +160,8 @@ def _check(problem, cloud, method, order, kernel, stencils, formulation, solver,
     ):  # fmt: skip
         if value not in known:
             raise ValueError(f"{name}: {value!r} is none of {', '.join(map(repr, known))}")
+    if formulation == "lsq" and method != "S":
+        raise ValueError(f'formulation: "lsq" is a form of method S, not of {method!r}; use method="S" or "loo"')
     if stencils is not None and any(c.kind == "periodic" for cs in problem.bcs.values() for c in cs):
         raise ValueError("stencils: those of a cloud do not reach periodic images; leave stencils out")
     if not isinstance(throw, (bool, np.bool_)):

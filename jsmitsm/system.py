@@ -26,7 +26,6 @@ COMPATIBLE = 1e-6
 KEPT = 0.5
 # Between the fields of a system both vary more with the order: less than this is a doubt, not a refusal.
 UNSURE, FALLEN = 1e-3, 0.1
-DOUBT = "The data may not balance"
 # Entries of the matrix, and of it and all that it is made of, in those of the rows of method S: of methods I and II,
 # whose rows reach the neighbours of neighbours, and of the least-squares form, where every row is a square block.
 # Measured from the growth of the peak memory with 3,000 to 39,000 particles in 2D (orders 4, 6) and 6,000 in 3D: 3.2
@@ -45,6 +44,8 @@ class Run:
         self.formulation = formulation
         self.seconds: dict[str, float] = {"local": 0.0, "assembly": 0.0, "solve": 0.0}
         self.messages: list[str] = []
+        self.against: list[str] = []  # those of the messages that speak against the solution
+        self.failed = False
         self.linear: dict[str, Any] = {}
         self.health: health.Health | None = None
         self.imbalance = np.inf  # of a floating field's data, once solved: the mean residual relative to them
@@ -117,13 +118,37 @@ class Run:
         """Raise, or note the failure where the caller asked for that."""
         if self.throw:
             raise SolveError(message, [int(i) for i in np.asarray(particles)[:100]])
-        self.messages.append(f"FAILED: {message}.")
+        self.failed = True
+        self._object(f"FAILED: {message}.")
+
+    def _object(self, message: str) -> None:
+        self.messages.append(message)
+        self.against.append(message)
+
+    def _forget(self) -> None:
+        """What an earlier step said speaks of other rows."""
+        self.messages, self.against, self.failed = [], [], False
 
     def step(self, nums: Numbers) -> tuple[Any, Any]:
         """Assemble and solve one linear system: values (N, F), and whether it went well."""
+        data, r, c, b = self.assembled(nums)
+        start = time.perf_counter()
+        x, good = self.solved(data, r, c, b)
+        values = dz.with_held(self.disc, nums, x)
+        self.seconds["solve"] += time.perf_counter() - start
+        if is_traced(values):
+            return values, jnp.isfinite(values).all()
+        self.nums, self.values = nums, values
+        return values, bool(good and np.isfinite(values).all() and not self.failed)
+
+    def assembled(self, nums: Numbers, parts: list[Any] | None = None) -> tuple[Any, Any, Any, Any]:
+        """The global system: entries of the matrix, their rows and columns, and the right-hand side.
+
+        parts: see :func:`jsmitsm.leastsquares.least_squares`.
+        """
         clock, disc = time.perf_counter, self.disc
-        t0 = clock()
-        self.messages.clear()  # those of an earlier step speak of other rows
+        start = clock()
+        self._forget()
         if disc.cut_off:
             self.messages.append(
                 f"The supports of at least {len(disc.cut_off)} particle(s), first {some(disc.cut_off)}, reach outside "
@@ -133,26 +158,15 @@ class Run:
             self.formulation = "lsq" if dz.prefers_least_squares(disc, nums) else "loo"
             self._refuse_too_large()
         if self.formulation == "lsq":
-            data, r, c, b = dz.least_squares(disc, nums)
-            t1 = t2 = clock()
+            made = dz.least_squares(disc, nums, parts)
+            local = clock()
         else:
             self.rows = classes, rows = self.local_rows(nums)
-            t1 = clock()
-            data, r, c = dz.matrix(disc, classes, rows)
-            b = dz.right_side(disc, nums, classes, rows)
-            t2 = clock()
-        x, good = self.solved(data, r, c, b)
-        values = dz.with_held(disc, nums, x)
-        for name, took in (("local", t1 - t0), ("assembly", t2 - t1), ("solve", clock() - t2)):
-            self.seconds[name] += took
-        if is_traced(values):
-            return values, jnp.isfinite(values).all()
-        self.nums, self.values = nums, values
-        return values, bool(good and np.isfinite(values).all() and not self._failed)
-
-    @property
-    def _failed(self) -> bool:
-        return any(m.startswith("FAILED") for m in self.messages)
+            local = clock()
+            made = *dz.matrix(disc, classes, rows), dz.right_side(disc, nums, classes, rows)
+        self.seconds["local"] += local - start
+        self.seconds["assembly"] += clock() - local
+        return made
 
     def solved(self, data: Any, r: Any, c: Any, b: Any, balanced: bool = True) -> tuple[Any, bool]:
         """Solve the global system; floating fields get a zero mean by a Lagrange multiplier.
@@ -162,14 +176,11 @@ class Run:
         disc = self.disc
         free = np.flatnonzero(~disc.held.reshape(-1))
         n, fields = len(free), disc.rec.fields
-        points = None if is_traced(disc.cloud.points) else np.asarray(disc.cloud.points)[free // fields]
-        if disc.floating:
-            data, r, c, b, points = _bordered(data, r, c, b, points, free % fields, disc.floating)
+        data, r, c, b, points = self._bordered(data, r, c, b)
         try:
             x: Any = linsolve.solve(
-                data, r, c, b, n=n + len(disc.floating), points=points, solver=self.solver,
-                elliptic=fields == 1 and not disc.floating, info=self.linear,
-            )  # fmt: skip
+                data, r, c, b, n=len(b), points=points, solver=self.solver, elliptic=self._elliptic, info=self.linear
+            )
         except linsolve.SingularMatrix as error:
             at = np.array([u for u in error.unknowns if u < n], int)
             particles = free[at] // fields
@@ -182,11 +193,30 @@ class Run:
         if not is_traced(x):
             x = np.asarray(x)
             if disc.floating:
-                system = linsolve.factor(data, r, c, len(b), points, self.solver, False)
+                system = linsolve.factor(data, r, c, len(b), points, self.solver, self._elliptic)
                 self.imbalance = _imbalance(system, x, b, n)
                 if balanced:
                     self._check_compatible(self.imbalance)
         return x[:n], True
+
+    @property
+    def _elliptic(self) -> bool:
+        """Whether multigrid may be expected to work."""
+        return self.disc.rec.fields == 1 and not self.disc.floating
+
+    def _bordered(self, data: Any, r: Any, c: Any, b: Any) -> tuple[Any, Any, Any, Any, Any]:
+        """The system and the places of its unknowns; a row and a column of ones more for every floating field."""
+        disc, fields = self.disc, self.disc.rec.fields
+        free = np.flatnonzero(~disc.held.reshape(-1))
+        points = None if is_traced(disc.cloud.points) else np.asarray(disc.cloud.points)[free // fields]
+        xp = jnp if is_traced(data, b) else np
+        for k, f in enumerate(disc.floating):
+            ids = np.flatnonzero(free % fields == f)
+            line = np.full(len(ids), len(free) + k)
+            data, b = xp.concatenate([data, np.ones(2 * len(ids))]), xp.concatenate([b, np.zeros(1)])
+            r, c = np.concatenate([r, ids, line]), np.concatenate([c, line, ids])
+            points = None if points is None else np.concatenate([points, np.full((1, points.shape[1]), np.nan)])
+        return data, r, c, b, points
 
     def _check_compatible(self, rest: float) -> None:
         """A field without values: its data must balance, up to what the discretisation explains."""
@@ -209,7 +239,7 @@ class Run:
             "coarse for its data"
         )
         if system and min(rest, other) < UNSURE:
-            self.messages.append(f"{DOUBT}, and nothing fixes the value {told}.")
+            self._object(f"The data may not balance, and nothing fixes the value {told}.")
         else:
             self.fail(f"the conditions are incompatible: nothing fixes the value, and the data do not balance {told}")
 
@@ -228,28 +258,21 @@ class Run:
         """The factors of the last step's system, most often still kept; None before there was one."""
         if self.nums is None:
             return None
-        disc = self.disc
         if self.formulation == "lsq":
-            data, r, c, b = dz.least_squares(disc, self.nums)
+            data, r, c, b = dz.least_squares(self.disc, self.nums)
         else:
             assert self.rows is not None
-            data, r, c = dz.matrix(disc, *self.rows)
-            b = np.zeros(int((~disc.held).sum()))
-        free = np.flatnonzero(~disc.held.reshape(-1))
-        fields = disc.rec.fields
-        points = np.asarray(disc.cloud.points)[free // fields]
-        if disc.floating:
-            data, r, c, b, points = _bordered(data, r, c, b, points, free % fields, disc.floating)
-        return linsolve.factor(data, r, c, len(b), points, self.solver, fields == 1 and not disc.floating)
+            data, r, c = dz.matrix(self.disc, *self.rows)
+            b = np.zeros(int((~self.disc.held).sum()))
+        data, r, c, b, points = self._bordered(data, r, c, b)
+        return linsolve.factor(data, r, c, len(b), points, self.solver, self._elliptic)
 
     @cached_property
     def misfit(self) -> np.ndarray | None:
         """By how much each particle's value misses its local fit, in the least-squares form."""
         if self.formulation != "lsq" or self.nums is None:
             return None
-        fits: list[Any] = []
-        dz.least_squares(self.disc, self.nums, fits)
-        return dz.misfit(self.disc, self.nums, fits, self.values)
+        return dz.misfit(self.disc, self.nums, self.values)
 
     def condition_numbers(self) -> tuple[np.ndarray, float]:
         """Of the particles' moment matrices (N,), and of the global system."""
@@ -261,10 +284,9 @@ class Run:
 
     def flags(self, estimated: Callable[[], float]) -> list[str]:
         """What speaks against the solution, in sentences; see :mod:`jsmitsm.flags`."""
-        failed = [m for m in self.messages if m.startswith(("FAILED", DOUBT))]
         if self.values is None or self.nums is None:
-            return failed
-        return flags(self, self.values, self.nums, estimated)[0] + failed
+            return list(self.against)
+        return flags(self, self.values, self.nums, estimated)[0] + self.against
 
     def stats(self) -> dict[str, Any]:
         """What a user may want to know about the solve."""
@@ -286,21 +308,6 @@ class Run:
             out["repaired"] = self.health.repaired
             out["weak"] = self.health.weak
         return out
-
-
-def _bordered(data, r, c, b, points, field, floating):
-    """Append one row and column of ones for every floating field."""
-    n = len(field)
-    xp = jnp if is_traced(data, b) else np
-    for k, f in enumerate(floating):
-        ids = np.flatnonzero(field == f)
-        line = np.full(len(ids), n + k)
-        data = xp.concatenate([data, np.ones(2 * len(ids))])
-        r, c = np.concatenate([r, ids, line]), np.concatenate([c, line, ids])
-    b = xp.concatenate([b, np.zeros(len(floating))])
-    if points is not None:
-        points = np.concatenate([points, np.full((len(floating), points.shape[1]), np.nan)])
-    return data, r, c, b, points
 
 
 def _imbalance(system: linsolve.Factor, x: np.ndarray, b: np.ndarray, n: int) -> float:

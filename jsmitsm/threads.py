@@ -19,8 +19,9 @@ def cores() -> int:
     return os.cpu_count() or 1
 
 
-# Programs that have run, so that no two threads compile one of them.
+# Programs that have run, so that no two threads compile one of them; a forgotten one only runs a first piece alone.
 _ready: set[Any] = set()
+_MOST = 1024
 
 
 def side_by_side(function: Callable[[Any], Any], items: Sequence[Any], program: Any) -> Iterator[Any]:
@@ -31,6 +32,8 @@ def side_by_side(function: Callable[[Any], Any], items: Sequence[Any], program: 
     """
     alone = 0 if program in _ready else 1
     yield from map(function, items[:alone])
+    if len(_ready) >= _MOST:
+        _ready.clear()
     _ready.add(program)
     threads = min(cores(), len(items) - alone)
     if threads < 2:

@@ -22,7 +22,7 @@ from jsmitsm.parametermaps import ParameterMap
 from jsmitsm.problem import Problem
 from jsmitsm.progress import bar
 from jsmitsm.solution import Solution
-from jsmitsm.solve import _check, solve
+from jsmitsm.solve import check, solve
 from jsmitsm.tracers import is_traced
 
 OPTIONS = ("method", "order", "stencils", "basis_terms", "formulation", "solver", "u0", "throw")
@@ -150,7 +150,7 @@ def _check_input(problem, cloud, kernel, objective, optimizer, steps, options) -
         if name not in OPTIONS:
             raise ValueError(f"{name}: no argument of js.tune or js.solve; those of js.solve are {', '.join(OPTIONS)}")
     o = {"method": "S", "order": 4, "formulation": "auto", "solver": "auto", "stencils": None, **options}
-    _check(problem, cloud, o["method"], o["order"], kernel, o["stencils"], o["formulation"], o["solver"])
+    check(problem, cloud, o["method"], o["order"], kernel, o["stencils"], o["formulation"], o["solver"])
     if is_traced(kernel, cloud, problem.params):
         raise ValueError("kernel, cloud, problem: traced by a JAX transform; js.tune runs on the host, call it outside")
     if objective != "estimate" and not callable(objective):
