@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm.recursion import Recursion
+from jsmitsm.smallsolve import outer_products
 from jsmitsm.taylor import Slot, factorial, index_of, multi_indices
 
 # Up to so many monomials their combinations are made at once.
@@ -36,17 +37,19 @@ def monomials(offset: Any, order: int) -> Any:
 @monomials.defjvp
 def _monomials_jvp(order, primals, tangents):
     # Differentiated column by column, which needs no more products than there are columns.
-    _, slope = jax.jvp(lambda x: jnp.stack(_columns(x, order), axis=1), primals, tangents)
+    _, slope = jax.jvp(lambda x: jnp.concatenate(_columns(x, order)).T, primals, tangents)
     return monomials(*primals, order), slope
 
 
 def _columns(offset: Any, order: int) -> list[Any]:
-    """The monomials one by one, (ns,) each: one product makes each from another."""
-    place = index_of(offset.shape[1], order)
-    columns = [jnp.ones_like(offset[:, 0])]
-    for a in multi_indices(offset.shape[1], order)[1:]:
+    """The monomials one by one, (1, ns) each: one product makes each from another."""
+    dim = offset.shape[1]
+    axes, place = jax.lax.split(offset.T, [1] * dim), index_of(dim, order)
+    columns = [jax.lax.full_like(axes[0], 1.0)]
+    for a in multi_indices(dim, order)[1:]:
         axis = next(k for k, n in enumerate(a) if n)
-        columns.append(columns[place[tuple(n - (k == axis) for k, n in enumerate(a))]] * offset[:, axis])
+        lower = tuple(n - (k == axis) for k, n in enumerate(a))
+        columns.append(columns[place[lower]] * axes[axis])
     return columns
 
 
@@ -57,10 +60,7 @@ def combinations(offset: Any, order: int, matrix: Any) -> Any:
     The outer products of the monomials and the matrix's rows are summed in one loop and the monomials never
     stored, in half the time of the matrix product.
     """
-    total = jnp.zeros((), offset.dtype)
-    for column, row in zip(_columns(offset, order), matrix, strict=True):
-        total = total + column[:, None] * row
-    return jax.lax.optimization_barrier(total)
+    return outer_products(_columns(offset, order), jax.lax.split(matrix, [1] * len(matrix)))
 
 
 @combinations.defjvp

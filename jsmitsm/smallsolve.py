@@ -6,10 +6,13 @@ do not run on every device; loops of rank-one updates do, and are faster at thes
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from functools import reduce
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 
 def safe_root(x: Any) -> Any:
@@ -101,20 +104,29 @@ class GramInverse(NamedTuple):
         return scale * (self.matrix @ (scale * t))
 
 
-# Outer products that are summed in one loop, and rows up to which that beats a matrix product.
-_TOGETHER, _FEW_ROWS = 12, 40
+# So many outer products are summed in one loop; up to so many rows that beats a matrix product.
+_TOGETHER, _FEW_ROWS = 18, 40
+
+
+def outer_products(left: Sequence[Any], right: Sequence[Any]) -> Any:
+    """sum_g left[g]^T right[g] of rows (1, k) and (1, m), without a loop over g: (k, m).
+
+    Where left and right are matrices this small, cut into rows, it takes half the time of their product.
+    """
+    across = (((0,), (0,)), ((), ()))
+    terms = [jax.lax.dot_general(a, b, across) for a, b in zip(left, right, strict=True)]
+    some = [reduce(jax.lax.add, terms[k : k + _TOGETHER]) for k in range(0, len(terms), _TOGETHER)]
+    # The barrier keeps the compiler from one loop over everything, which would not stay in registers.
+    return reduce(jax.lax.add, map(jax.lax.optimization_barrier, some))
 
 
 @jax.custom_jvp
 def gram_matrix(a: Any) -> Any:
-    """A^T A for a tall A (n, k): matrices this small are multiplied faster as a sum of outer products."""
-    if a.shape[0] > _FEW_ROWS:
+    """A^T A for a tall A (n, k)."""
+    if len(a) > _FEW_ROWS:
         return a.T @ a
-    total = jnp.zeros((), a.dtype)
-    for start in range(0, a.shape[0], _TOGETHER):
-        # The barrier keeps the compiler from one loop over everything, which would not stay in registers.
-        total = total + jax.lax.optimization_barrier(sum(row[:, None] * row for row in a[start : start + _TOGETHER]))
-    return total
+    rows = jax.lax.split(a, [1] * len(a))
+    return outer_products(rows, rows)
 
 
 @gram_matrix.defjvp
@@ -165,21 +177,22 @@ def _sweeps(g: Any) -> Any:
     With v = g[j] - e_j a sweep is g - v v^T / g[j, j], but for 2 on the diagonal, which is taken off at the end.
     """
     k = g.shape[0]
+    unit = np.eye(k, dtype=g.dtype)[:, :, None]
 
     def factors(g, j):
-        row = jax.lax.dynamic_index_in_dim(g, j, 0, keepdims=False)
-        pivot = jax.lax.dynamic_index_in_dim(row, j, 0, keepdims=False)
-        v = row - (jnp.arange(k) == j)[:, None]
-        return v, v / pivot
+        # An unsigned number needs no look whether it is negative.
+        row, one = (jax.lax.dynamic_index_in_dim(x, j, 0, keepdims=False) for x in (g, unit))
+        v = jax.lax.sub(row, jax.lax.broadcast_in_dim(one, row.shape, (0, 1)))
+        return v, v / jax.lax.dynamic_index_in_dim(row, j, 0)
 
     def sweep(j, carry):
         g, v, u = carry
         # The barrier keeps the update in place: without it the compiler joins it with the next row and copies g.
         g = jax.lax.optimization_barrier(g - v[:, None] * u[None])
-        return g, *factors(g, jnp.minimum(j + 1, k - 1))
+        return g, *factors(g, jax.lax.min(j + np.uint32(1), np.uint32(k - 1)))
 
-    g, *_ = jax.lax.fori_loop(0, k, sweep, (g, *factors(g, 0)))
-    return 2.0 * jnp.eye(k, dtype=g.dtype)[:, :, None] - g
+    g, *_ = jax.lax.fori_loop(np.uint32(0), np.uint32(k), sweep, (g, *factors(g, np.uint32(0))))
+    return 2.0 * unit - g
 
 
 def _pivoted_inverse(gram: Any, tolerance: float) -> Any:
