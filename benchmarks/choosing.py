@@ -3,7 +3,6 @@
 Writes benchmarks/data/choosing.json; ``python -m benchmarks.readme`` puts its tables into the pages.
 """
 
-import argparse
 import json
 import os
 import platform
@@ -14,6 +13,7 @@ import jax
 import numpy as np
 
 import jsmitsm as js
+from benchmarks.commandline import arguments
 from benchmarks.problems import CASES, slope
 
 jax.config.update("jax_enable_x64", True)
@@ -165,6 +165,4 @@ def main(names=()):
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("names", nargs="*")
-    main(parser.parse_args().names)
+    main(arguments(__doc__, names="experiment").names)

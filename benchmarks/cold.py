@@ -17,6 +17,7 @@ import tempfile
 from pathlib import Path
 
 from benchmarks import machine
+from benchmarks.commandline import arguments
 
 DATA = Path(__file__).parent / "data" / "cold.json"
 REPEATS = 5
@@ -72,4 +73,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    arguments(__doc__)
     main()

@@ -19,6 +19,7 @@ import numpy as np
 
 import jsmitsm as js
 from benchmarks import machine
+from benchmarks.commandline import arguments
 from benchmarks.problems import CASES, FACTOR, RANK, Case
 
 DATA = Path(__file__).parent / "data" / "equations.json"
@@ -132,24 +133,23 @@ def write(lines: dict[tuple[str, int], dict[str, Any]]) -> None:
     DATA.write_text(json.dumps(data, indent=1) + "\n")
 
 
-def main(arguments: list[str]) -> None:
+def main(names: list[str], only_list: bool, resumed: bool, estimate: bool) -> None:
     jax.config.update("jax_enable_x64", True)
-    names = [a for a in arguments if not a.startswith("--")]
     unknown = sorted(set(names) - set(MEASURED))
-    if "--list" in arguments or unknown:
+    if only_list or unknown:
         known = "\n".join(f"{name:19s} {case.about}" for name, case in MEASURED.items())
         sys.exit(f"no such case: {', '.join(unknown)}\n{known}" if unknown else known)
-    resumed = "--resume" in arguments
     kept = json.loads(DATA.read_text())["lines"] if DATA.exists() and (names or resumed) else []
     lines = {(line["case"], line["order"]): line for line in kept if line["case"] in MEASURED}
     print(HEAD)
     for name in names or MEASURED:
         for order in MEASURED[name].ceilings:
             if not resumed or (name, order) not in lines:
-                lines[name, order] = run(MEASURED[name], order, "--no-estimate" not in arguments)
+                lines[name, order] = run(MEASURED[name], order, estimate)
                 write(lines)
             print(shown(lines[name, order]), flush=True)
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    given = arguments(__doc__, "list", "resume", "no-estimate", names="case")
+    main(given.names, given.list, given.resume, not given.no_estimate)

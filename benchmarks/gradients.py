@@ -16,6 +16,7 @@ import time
 from pathlib import Path
 
 from benchmarks import machine
+from benchmarks.commandline import arguments
 
 DATA = Path(__file__).parent / "data" / "gradients.json"
 SIDES, REPEATS = (32, 141), 7
@@ -121,8 +122,8 @@ def apart(*arguments: str):
 def main() -> None:
     about, results, rows = machine.describe(), [], []
     for side in SIDES:
-        found = apart("times", str(side))
-        found["peak"] = {name: apart("peak", str(side), name) for name in ("forward", "gradient")}
+        found = apart(f"--times={side}")
+        found["peak"] = {"forward": apart(f"--peak={side}"), "gradient": apart(f"--peak={side}", "--gradient")}
         results.append(found)
         forward = found["seconds"]["forward"]
         for name in PARAMETERS:
@@ -147,9 +148,10 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    if sys.argv[1:2] == ["times"]:
-        print(json.dumps(times(int(sys.argv[2]))))
-    elif sys.argv[1:2] == ["peak"]:
-        print(json.dumps(peak(int(sys.argv[2]), sys.argv[3] == "gradient")))
+    given = arguments(__doc__, "times=", "peak=", "gradient")  # in processes of their own
+    if given.times:
+        print(json.dumps(times(int(given.times))))
+    elif given.peak:
+        print(json.dumps(peak(int(given.peak), given.gradient)))
     else:
         main()

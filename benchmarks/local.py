@@ -20,6 +20,7 @@ import jax.numpy as jnp
 
 import jsmitsm as js
 from benchmarks import machine
+from benchmarks.commandline import arguments
 from jsmitsm import discretize as dz
 from jsmitsm.solve import discretized
 
@@ -64,18 +65,14 @@ def apart(case: tuple[int, ...], variable: bool, cores: set[int]) -> float:
     mine = os.sched_getaffinity(0)
     os.sched_setaffinity(0, cores)  # a process starts on the cores of its parent
     try:
-        command = [sys.executable, "-m", "benchmarks.local", "one", *map(str, case), str(int(variable))]
+        command = [sys.executable, "-m", "benchmarks.local", "--one", *map(str, case), str(int(variable))]
         done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=Path(__file__).parent.parent)
     finally:
         os.sched_setaffinity(0, mine)
     return float(done.stdout.split()[-1])
 
 
-def main(arguments: list[str]) -> None:
-    if arguments[:1] == ["one"]:
-        *case, variable = map(int, arguments[1:])
-        print(microseconds(*case, bool(variable)))
-        return
+def main() -> None:
     about, rows = machine.describe(), []
     every = os.sched_getaffinity(0)
     for case in CASES:
@@ -95,4 +92,9 @@ def main(arguments: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    given = arguments(__doc__, "one", names="number")  # one of them: in a process of its own
+    if given.one:
+        *case, variable = map(int, given.names)
+        print(microseconds(*case, bool(variable)))
+    else:
+        main()

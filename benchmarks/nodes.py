@@ -14,6 +14,7 @@ from pathlib import Path
 import jax
 import numpy as np
 from benchmarks import machine
+from benchmarks.commandline import arguments
 from benchmarks.problems import CASES
 from benchmarks.problems.shapes import quality
 
@@ -67,4 +68,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    arguments(__doc__)
     main()

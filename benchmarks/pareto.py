@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import json
 import math
-import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -25,6 +24,7 @@ import numpy as np
 
 import jsmitsm as js
 from benchmarks import machine, peers
+from benchmarks.commandline import arguments
 from benchmarks.problems import CASES, Case
 from benchmarks.problems.shapes import conducting
 from jsmitsm.simplices import simplices
@@ -293,12 +293,10 @@ def picture(lines: list[dict[str, Any]]) -> None:
     figure.savefig(PICTURE, dpi=130)
 
 
-def main(arguments: list[str]) -> None:
+def main(names: list[str], quick: bool, only: str) -> None:
     jax.config.update("jax_enable_x64", True)
-    quick = "--quick" in arguments
-    names = [a for a in arguments if not a.startswith("-")] or list(SCENES)
+    names = names or list(SCENES)
     kept = json.loads(DATA.read_text())["lines"] if DATA.exists() else []
-    only = next((a.removeprefix("--only=") for a in arguments if a.startswith("--only=")), "")
     lines = [line for line in kept if line["scene"] not in names or not line["name"].startswith(only)]
     about = machine.describe()
     for name in names:
@@ -312,4 +310,5 @@ def main(arguments: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    given = arguments(__doc__, "quick", "only=", names="scene")
+    main(given.names, given.quick, given.only)

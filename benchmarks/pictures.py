@@ -1,6 +1,5 @@
 """The pictures of the README and the documentation, drawn into docs/images: ``python -m benchmarks.pictures``."""
 
-import argparse
 from pathlib import Path
 
 import jax
@@ -10,6 +9,7 @@ import numpy as np
 import jsmitsm as js
 import jsmitsm.plot
 import jsmitsm.sdf
+from benchmarks.commandline import arguments
 from benchmarks.problems import CASES
 
 matplotlib.use("Agg")
@@ -79,6 +79,4 @@ def main(names=("first", "slices", "errors")):
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("names", nargs="*", default=["first", "slices", "errors"])
-    main(parser.parse_args().names)
+    main(arguments(__doc__, names="picture").names or ("first", "slices", "errors"))

@@ -5,11 +5,12 @@ the ``tables`` of the files in benchmarks/data, each with ``columns``, ``rows`` 
 data stays empty. With ``--check`` nothing is written, and a page that would change is an error.
 """
 
-import argparse
 import json
 import re
 import sys
 from pathlib import Path
+
+from benchmarks.commandline import arguments
 
 ROOT = Path(__file__).parent.parent
 PLACE = re.compile(r"(<!-- table: ([\w-]+)[^\n]*-->\n)(.*?)(<!-- end of table -->)", re.DOTALL)
@@ -51,6 +52,4 @@ def main(check=False):
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--check", action="store_true")
-    sys.exit(main(parser.parse_args().check))
+    sys.exit(main(arguments(__doc__, "check").check))

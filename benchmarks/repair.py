@@ -16,6 +16,7 @@ import numpy as np
 
 import jsmitsm as js
 from benchmarks import stability as st
+from benchmarks.commandline import arguments
 from benchmarks.machine import describe
 from benchmarks.problems.families import at_home, smooth
 from jsmitsm import discretize as dz
@@ -98,4 +99,5 @@ def main():
 
 
 if __name__ == "__main__":
+    arguments(__doc__)
     main()

@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks import machine
+from benchmarks.commandline import arguments
 
 DATA = Path(__file__).parent / "data" / "scale.json"
 ORDER = 4
@@ -94,22 +95,23 @@ def table(lines: list[dict], about: dict) -> dict:
     return {"columns": columns, "rows": rows, "note": note}
 
 
-def main(arguments: list[str]) -> None:
-    if arguments[:1] == ["one"]:
-        print(json.dumps(one(int(arguments[1]), int(arguments[2]))))
-        return
+def main(quick: bool) -> None:
     about, lines = machine.describe(), []
     for dim, sides in SIDES.items():
-        for side in sides[: 2 if "--quick" in arguments else None]:
-            command = [sys.executable, "-m", "benchmarks.scale", "one", str(dim), str(side)]
+        for side in sides[: 2 if quick else None]:
+            command = [sys.executable, "-m", "benchmarks.scale", "--one", str(dim), str(side)]
             done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=Path(__file__).parent.parent)
             lines.append(json.loads(done.stdout.splitlines()[-1]))
             print(lines[-1], flush=True)
     made = table(lines, about)
-    if "--quick" not in arguments:
+    if not quick:
         DATA.write_text(json.dumps({"machine": about, "lines": lines, "tables": {"scale": made}}, indent=1) + "\n")
     print("\n".join(" | ".join(row) for row in [made["columns"], *made["rows"]]) + "\n" + made["note"])
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    given = arguments(__doc__, "quick", "one", names="number")  # one: a dimension and a size, in a process of its own
+    if given.one:
+        print(json.dumps(one(*map(int, given.names))))
+    else:
+        main(given.quick)

@@ -7,7 +7,6 @@ out. Seconds are medians of repeats after a first call that compiles, on clouds 
 from __future__ import annotations
 
 import json
-import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -22,6 +21,7 @@ import numpy as np
 
 import jsmitsm as js
 from benchmarks import machine
+from benchmarks.commandline import arguments
 from jsmitsm import assembly, linsolve, repeats, rows
 from jsmitsm import discretize as dz
 from jsmitsm.solve import discretized
@@ -201,4 +201,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    arguments(__doc__)
+    main()

@@ -12,7 +12,6 @@ error over a grid of (h, d) within the Lebesgue bound: a choice that needs the e
 from __future__ import annotations
 
 import json
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -24,6 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jsmitsm as js
+from benchmarks.commandline import arguments
 from benchmarks.machine import describe
 from benchmarks.problems import CASES, Case, laplace
 from jsmitsm.objective import nearest_distance, reference
@@ -353,10 +353,8 @@ def write(kept: dict[tuple[str, str], Any]) -> None:
     DATA.write_text(json.dumps({"machine": describe(), "tables": tables(results), "results": results}) + "\n")
 
 
-def main(arguments: list[str]) -> None:
+def main(wanted: list[str], quick: bool, again: bool, only_table: bool) -> None:
     jax.config.update("jax_enable_x64", True)
-    quick, again, only_table = (flag in arguments for flag in ("--quick", "--again", "--table"))
-    wanted = [a for a in arguments if not a.startswith("-")]
     names = [n for n in (*SETUPS, *GRADED) if not wanted or any(w in n for w in wanted)]
     kept = {} if quick or not DATA.exists() else {(e["setup"], e["method"]): e for e in json.loads(DATA.read_text())["results"]}
     head = None
@@ -379,4 +377,5 @@ def main(arguments: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    given = arguments(__doc__, "quick", "again", "table", names="name")
+    main(given.names, given.quick, given.again, given.table)

@@ -112,3 +112,23 @@ def refusals():
 def test_what_the_table_says_it_does_not_do_is_refused(message, call):
     with pytest.raises(ValueError, match=message):
         call()
+
+
+def test_every_benchmark_prints_its_help_and_refuses_unknown_flags(monkeypatch, capsys):
+    """Both before anything is measured."""
+    from benchmarks.commandline import arguments
+
+    scripts = [path for path in (ROOT / "benchmarks").glob("*.py") if "\nif __name__ == " in path.read_text()]
+    assert len(scripts) > 10
+    for path in scripts:
+        main = path.read_text().rpartition('if __name__ == "__main__":')[2]
+        assert "arguments(__doc__" in main or "ArgumentParser(description=__doc__" in path.read_text(), path.name
+    for given, told in (["--help"], "What it is."), (["--bogus"], "unrecognized arguments: --bogus"), (["x"], "x"):
+        monkeypatch.setattr("sys.argv", ["script", *given])
+        with pytest.raises(SystemExit):
+            arguments("What it is.", "quick", "only=")
+        seen = capsys.readouterr()
+        assert told in seen.out + seen.err
+    monkeypatch.setattr("sys.argv", ["script", "--quick", "--only=S", "one", "two"])
+    found = arguments("", "quick", "only=", names="scene")
+    assert (found.quick, found.only, found.names) == (True, "S", ["one", "two"])
