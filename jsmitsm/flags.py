@@ -205,7 +205,7 @@ def _misfit(run: Any, values: np.ndarray, nums: Any, out: list[str], found: dict
         return
     spread = float(np.ptp(values)) or 1.0
     cells = len(values) ** (1.0 / run.disc.rec.dim)
-    found["misfit"] = float(np.sqrt(np.mean(run.misfit**2)) * cells / spread)
+    found["misfit"] = float(np.sqrt(np.mean((run.misfit / spread) ** 2)) * cells)  # no square overflows
     if found["misfit"] > MISFIT:
         out.append(
             f"No function fits the equation and the conditions on this cloud: the misfit adds up to "

@@ -186,7 +186,8 @@ class Solution:
 
         error = error_estimate(self)
         if not is_traced(error, self._values):
-            self._share = float(np.linalg.norm(error) / (np.linalg.norm(self.u) or 1.0))
+            size = np.abs(self.u).max(initial=0.0) or 1.0  # no square overflows
+            self._share = float(np.linalg.norm(error / size) / (np.linalg.norm(self.u / size) or 1.0))
         return error
 
     def _estimated(self) -> float:

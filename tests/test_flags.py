@@ -103,6 +103,17 @@ def test_least_squares_squares_the_operator():
     assert np.abs(sol.u - jax.vmap(smooth)(sol.cloud.points)).max() < 1e-4
 
 
+@pytest.mark.parametrize("form", ["loo", "lsq"])
+@pytest.mark.filterwarnings("error")
+def test_squares_of_huge_values_do_not_overflow(form):
+    """1e200 squared is no number; the flags are those of the same problem in other units."""
+    for size in (1.0, 1e200):
+        harmonic = js.dirichlet(lambda x: size * jnp.sin(2 * x[0]) * jnp.exp(2 * x[1]))
+        sol = js.solve(js.Problem(laplace, dict.fromkeys(SIDES, harmonic)), square(13), formulation=form)
+        assert sol.flags == [] and np.max(sol.error_estimate()) < 1e-2 * size
+        assert sol.flags == []  # with the estimate
+
+
 def test_flags_survive_pickling():
     eps = 0.01
     layer = lambda x: x[0] - jnp.expm1(x[0] / eps) / jnp.expm1(1 / eps)
