@@ -13,7 +13,7 @@ from jsmitsm.clouds import Cloud
 from jsmitsm.kernels import Constant, Kernel
 from jsmitsm.moments import Scheme
 from jsmitsm.neighbours import Stencils
-from jsmitsm.periodic import Images, periodic_images
+from jsmitsm.periodic import Images, periodic_images, with_corners
 from jsmitsm.problem import Problem
 from jsmitsm.recursion import Recursion, free_indices, recursion
 from jsmitsm.supports import check_supports, cut_off, default_kernel, find_stencils
@@ -96,7 +96,7 @@ def discretize(
     traced = _traced(problem, cloud.dim)
     _check_operator(traced, problem, order)
     rec = recursion(cloud.dim, order, problem.fields, traced.slots, traced.pattern, traced.order)
-    groups = group_conditions(problem, cloud, order, traced.order)
+    groups = group_conditions(problem, with_corners(problem, cloud), order, traced.order)
     held = np.zeros((len(cloud), problem.fields), bool)
     for group in groups:
         for k in group.held:

@@ -85,6 +85,53 @@ def periodic_images(problem: Problem, cloud: Cloud) -> tuple[Images, np.ndarray]
     return Images(n, np.concatenate(owner), np.concatenate(moved), np.flatnonzero(partner != np.arange(n))), partner
 
 
+def with_corners(problem: Problem, cloud: Cloud) -> Cloud:
+    """The cloud as the other conditions see it: corners of the first group of a pair belong to the side they meet.
+
+    A strip that repeats itself has no corners; what a lattice gives to its left side lies on the bottom too, and
+    without the bottom's condition its equation would be one-sided and lose digits. Only flat sides are recognised,
+    and those whose values are no array over the group.
+    """
+    pairs = dict.fromkeys(c.groups for cs in problem.bcs.values() for c in cs if c.kind == "periodic")
+    periodic = {name for pair in pairs for name in pair}
+    sides = [name for name in problem.bcs if name in cloud.groups and name not in periodic and _anywhere(
+        problem.bcs[name], len(cloud.groups[name]))]  # fmt: skip
+    if not pairs or not sides or not periodic <= set(cloud.groups) or is_traced(cloud.points, cloud.normals):
+        return cloud
+    if cloud.normals is None:
+        return cloud
+    fixed = [c.indices for cs in problem.bcs.values() for c in cs if c.kind == "fix"]
+    ids = np.unique(np.concatenate([cloud.groups[first] for first, _ in pairs]))
+    ids = np.setdiff1d(ids, np.concatenate([[], *fixed]).astype(int))
+    groups, normals = dict(cloud.groups), np.array(cloud.normals)
+    for name in sides:
+        found, normal = _on_side(np.asarray(cloud.points), np.asarray(cloud.normals), ids, cloud.groups[name])
+        groups = {other: np.setdiff1d(members, found) for other, members in groups.items()}
+        groups[name] = np.concatenate([cloud.groups[name], found])
+        normals[found], ids = normal, np.setdiff1d(ids, found)
+    return Cloud(cloud.points, groups, normals)
+
+
+def _anywhere(conditions: list[Any], n: int) -> bool:
+    """Whether conditions can be asked for at any particle: no part of them is an array over the n of their group."""
+    return not any(np.ndim(c.parts[k]) and np.shape(c.parts[k])[0] == n for c in conditions for k in c.numbers)
+
+
+def _on_side(
+    points: np.ndarray, normals: np.ndarray, ids: np.ndarray, side: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Those of the particles ``ids`` that lie in the plane of the ``side`` near them, and its normals there."""
+    from scipy.spatial import cKDTree
+
+    distance, near = cKDTree(points).query(points[ids], k=min(4 ** points.shape[1], len(points)))
+    belongs = np.isin(near, side)
+    nearest = near[np.arange(len(ids)), belongs.argmax(axis=1)]
+    height = np.einsum("nkd,nd->nk", points[near] - points[ids][:, None], normals[nearest])
+    flat = np.abs(np.where(near == nearest[:, None], height, 0.0)).max(axis=1)
+    on = belongs.any(axis=1) & (np.maximum(flat, height.max(axis=1)) <= 1e-6 * distance[:, -1])
+    return ids[on], normals[nearest[on]]
+
+
 def _matched(points: np.ndarray, cloud: Cloud, first: str, second: str) -> tuple[np.ndarray, np.ndarray]:
     """The translation from one group to the other, and each second particle's partner."""
     from scipy.spatial import cKDTree
