@@ -200,7 +200,8 @@ def pieces(disc: Discretization, nums: Numbers, cls: Class, *more: Any) -> list[
     # The last one tells whether everything is traced here, as under jit.
     if is_traced(disc.points, disc.kernel, vars(nums), cls.neighbours, more, jnp.asarray(np.zeros(()))):
         return [cls]
-    step = -(-n // min(-(-n // PIECE), MOST_PIECES))
+    count = min(-(-n // PIECE), MOST_PIECES)
+    step = -(-n // (-(-count // cores()) * cores()))  # as many pieces for each core
     cuts = [slice(start, start + step) for start in range(0, n, step)]
     return [replace(cls, ids=cls.ids[some], neighbours=cls.neighbours[some]) for some in cuts]
 
