@@ -20,7 +20,7 @@ from jsmitsm.kernels import Kernel
 from jsmitsm.moments import Block, Elimination, Row, Scheme, Support
 from jsmitsm.program import in_one_program
 from jsmitsm.recursion import row_lifts
-from jsmitsm.tracers import is_traced
+from jsmitsm.tracers import is_traced, recorded
 
 # Particles per block: larger blocks leave the cache and are several times slower; in one of a power of two, rows of
 # the small matrices fall on the same lines of the cache.
@@ -126,8 +126,7 @@ def _in_size_classes(function: Any) -> Any:
 
 def _inside(arguments: Any) -> bool:
     """Whether the call is part of a larger program: an inner one has no compiler options of its own."""
-    # Under jit every operation is recorded, one on constants too; this one compiles nothing elsewhere.
-    return is_traced(arguments, jnp.asarray(np.zeros(())))
+    return recorded() or is_traced(arguments)
 
 
 @_in_size_classes

@@ -23,7 +23,7 @@ from jsmitsm.progress import each, shown
 from jsmitsm.repeats import repeats
 from jsmitsm.supports import default_kernel
 from jsmitsm.threads import cores, side_by_side
-from jsmitsm.tracers import is_traced
+from jsmitsm.tracers import is_traced, recorded
 
 # Particles that the cores share in pieces, between whose ends a progress bar moves; every piece costs a millisecond.
 PIECE, MOST_PIECES = 4096, 32
@@ -197,8 +197,7 @@ def pieces(disc: Discretization, nums: Numbers, cls: Class, *more: Any) -> list[
     n = len(cls.ids)
     if n <= 2 * PIECE or not (shown() or cores() > 1):
         return [cls]
-    # The last one tells whether everything is traced here, as under jit.
-    if is_traced(disc.points, disc.kernel, vars(nums), cls.neighbours, more, jnp.asarray(np.zeros(()))):
+    if recorded() or is_traced(disc.points, disc.kernel, vars(nums), cls.neighbours, more):
         return [cls]
     count = min(-(-n // PIECE), MOST_PIECES)
     step = -(-n // (-(-count // cores()) * cores()))  # as many pieces for each core
