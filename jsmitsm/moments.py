@@ -6,7 +6,6 @@ s = (x_g - x_i) / l, scaled by a length l of the support, so nothing here knows 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
@@ -16,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm.kernels import EDGE, Kernel, fitted
-from jsmitsm.polynomials import FEW, combinations, functionals, monomials, whitening
+from jsmitsm.polynomials import FEW, Combinations, functionals, monomials, whitening
 from jsmitsm.recursion import Recursion, Slot, constraints, substitution
 from jsmitsm.smallsolve import general_inverse, gram_inverse, min_norm, null_space, safe_root, solve_gram
 from jsmitsm.taylor import multi_indices
@@ -198,12 +197,11 @@ class System(NamedTuple):
     own_rows: Any  # (n_own, F K)
     own_scale: Any  # (n_own,)
     own_solve: Any  # (free, n_own)
-    values: Any  # (rows of data, F K): the data as functionals of U
+    values: Any  # (rows of data, F K): the data as functionals of U, an array or Combinations
     phi: Any  # values @ reduced
     weight: Any  # (rows of data,)
     tests: Any  # (rows of data, free) or None
     data_scale: Any  # (ns, n_data)
-    times: Callable[[Any], Any] | None  # values @ matrix (F K, m) without forming them, where that is faster
 
 
 def local_system(
@@ -218,11 +216,12 @@ def local_system(
     (rows of data, F K): what the data are, the neighbours' values if not given.
     """
     rec = scheme.rec
-    plain = values is None and rec.fields == 1 and not scheme.n_data
-    times = partial(combinations, near.offset, rec.order) if plain and rec.size <= FEW else None
-    p = monomials(near.offset, rec.order)
-    ns, fields = p.shape[0], rec.fields
+    ns, fields = len(near.offset), rec.fields
     weight = near.weight.at[0].set(0.0) if skip_self else near.weight
+    if values is None and rec.size <= FEW and fields == 1 and not scheme.n_data:
+        values = Combinations(near.offset, rec.order)
+    else:
+        p = monomials(near.offset, rec.order)
     if values is None:
         values = jnp.einsum("gk,fh->gfhk", p, jnp.eye(fields)).reshape(ns * fields, -1) if fields > 1 else p
     weights = jnp.repeat(weight, fields)
@@ -236,13 +235,12 @@ def local_system(
     own_rows, own_scale = jnp.zeros((0, basis.shape[0])), jnp.zeros(0)
     own_solve = jnp.zeros((basis.shape[1], 0))
     if scheme.n_own and scheme.method != "SSPH":
-        at = jnp.zeros(rec.size, p.dtype).at[0].set(1.0)
+        at = jnp.zeros(rec.size, basis.dtype).at[0].set(1.0)
         own_rows, own_scale = functionals(scheme.own, own, at, rec, near.length)
         z, own_solve = null_space(own_rows @ basis)
         basis = basis @ z
         tests = None if tests is None else tests @ z
-    phi = values @ basis if times is None else times(basis)
-    return System(solution, basis, own_rows, own_scale, own_solve, values, phi, weights, tests, data_scale, times)
+    return System(solution, basis, own_rows, own_scale, own_solve, values, values @ basis, weights, tests, data_scale)
 
 
 def moment_matrix(system: System) -> Any:
@@ -272,9 +270,9 @@ def functional(scheme: Scheme, near: Support, system: System, wanted: Any) -> tu
 
 def _lacking(system: System, wanted: Any, w: Any, matrix: Any) -> Any:
     """matrix^T (wanted^T - values^T w): what the data leave of each wanted functional of matrix's columns."""
-    if system.times is None:
-        return matrix.T @ (wanted.T - system.values.T @ w)
-    return matrix.T @ wanted.T - system.times(matrix).T @ w
+    if isinstance(system.values, Combinations):
+        return matrix.T @ wanted.T - (system.values @ matrix).T @ w
+    return matrix.T @ (wanted.T - system.values.T @ w)
 
 
 def row(scheme: Scheme, near: Support, solution: Elimination, own: Any, data: Any, tests: Any) -> Row:

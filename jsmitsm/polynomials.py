@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache, partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -53,21 +53,30 @@ def _columns(offset: Any, order: int) -> list[Any]:
     return columns
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(1,))
-def combinations(offset: Any, order: int, matrix: Any) -> Any:
-    """monomials(offset, order) @ matrix, (ns, K) @ (K, m), for at most FEW monomials.
+class Combinations(NamedTuple):
+    """What stands for ``monomials(offset, order)``, of at most FEW monomials, in products with matrices."""
 
-    The outer products of the monomials and the matrix's rows are summed in one loop and the monomials never
-    stored, in half the time of the matrix product.
-    """
+    offset: Any  # (ns, D)
+    order: int
+
+    def __matmul__(self, matrix: Any) -> Any:
+        """(ns, K) @ (K, m) or (K,)."""
+        if matrix.ndim == 1:
+            return (self @ matrix[:, None])[:, 0]
+        return _combined(self.offset, self.order, matrix)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(1,))
+def _combined(offset: Any, order: int, matrix: Any) -> Any:
+    # Each monomial times its row of the matrix, summed in one loop, and the monomials never stored: half the time.
     return outer_products(_columns(offset, order), jax.lax.split(matrix, [1] * len(matrix)))
 
 
-@combinations.defjvp
-def _combinations_jvp(order, primals, tangents):
+@_combined.defjvp
+def _combined_jvp(order, primals, tangents):
     (offset, matrix), (change, other) = primals, tangents
     p, slope = jax.jvp(lambda x: monomials(x, order), (offset,), (change,))
-    return combinations(offset, order, matrix), slope @ matrix + p @ other
+    return _combined(offset, order, matrix), slope @ matrix + p @ other
 
 
 @lru_cache(maxsize=256)
