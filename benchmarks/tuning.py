@@ -67,6 +67,8 @@ def _setups() -> dict[str, Setup]:
         _setup("jittered", "jittered", (2, 2, 4), lambda x: jnp.cos(3 * x[0]) * jnp.exp(x[1]), spacing=1 / 13),
         _setup("narrow peak", "narrow peak", (2, 2, 4), wider),
         _setup("3D", "solid", (2, 2, 4), lambda x: jnp.cos(2 * x[0] + x[1]) * jnp.exp(-x[2]), spacing=1 / 6),
+        _setup("3D wave", "solid wave", (2, 2, 4), lambda x: jnp.sin(3 * x[0] + 2 * x[1]) * jnp.cos(3 * x[2] + 0.3),
+               spacing=1 / 7),
     ]
     return {s.name: s for s in found}
 

@@ -211,6 +211,9 @@ TUNED = (
            ceilings={4: 6e-2}),
     on_box("solid", "laplacian(u) = f in 3D, u = exp(x) sin 2y cos z", laplace,
            lambda x: jnp.exp(x[0]) * jnp.sin(2 * x[1]) * jnp.cos(x[2]), *_UNIT[3], 7, 0.1, 2, ceilings={4: 4e-5}),
+    on_box("solid wave", "laplacian(u) = f in 3D, u = sin(4x + 1) cos 3y cos(3z - 1/2)", laplace,
+           lambda x: jnp.sin(4 * x[0] + 1) * jnp.cos(3 * x[1]) * jnp.cos(3 * x[2] - 0.5), *_UNIT[3], 8, 0.1, 3,
+           ceilings={4: 3e-3}),
 )  # fmt: skip
 
 LINEAR = table(*SCATTERED, *ON_LATTICES, *TUNED)
