@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,6 +26,9 @@ _SAMPLE = 16
 _EVEN = 0.5
 # Around a particle the radii of stencils of one size differ by less than this ratio, but for jumps in the spacing.
 _JUMP = 2.2
+# The first search of a process looks at all distances of so few particles: importing scipy.spatial takes a tenth of a
+# second, several times as long. So many rows of distances stay in cache.
+_ALL_PAIRS, _ROWS = 2048, 128
 # Searches for fewer particles are done before a second core would have begun.
 _MANY = 4000
 
@@ -104,12 +108,12 @@ def nearest(points: np.ndarray, size: int, which: np.ndarray | None = None) -> S
             f"size: {size} neighbours asked for, but the cloud has only {n} particles; lower the order or add particles"
         )
     centres = points if which is None else points[which]
-    tree = _tree(points)
-    distance, index = _with_ties(tree, centres, size)
+    distance, index = _with_ties(_searcher(points), centres, size)
+    _once.clear()
     radius = distance[:, size - 1] * (1 + _TIE)
     inside = distance <= radius[:, None]
     if inside[:, -1].any() and distance.shape[1] < n:  # more ties than were looked for
-        return _ragged(tree, centres, radius, which)
+        return _ragged(points, centres, radius, which)
     width = int(inside.sum(axis=1).max())
     index = np.where(inside[:, :width], index[:, :width], -1).astype(np.int32)
     return Stencils(_self_first(index, which), radius)
@@ -150,7 +154,7 @@ def evenly_spaced(points: np.ndarray) -> bool:
     Judged by the distance of the nearest neighbour, in a sample, relative to the spacing around it.
     """
     count = min(3 ** points.shape[1], len(points) - 1)
-    distance, _ = _query(_tree(points), _sampled(points, 4 * _SAMPLE), count + 1)
+    distance, _ = _query(_searcher(points), _sampled(points, 4 * _SAMPLE), count + 1)
     volume = {1: 2.0, 2: np.pi, 3: 4.0 * np.pi / 3.0}[points.shape[1]]
     spacing = distance[:, -1] * (volume / (count + 1)) ** (1.0 / points.shape[1])
     relative = np.sort(distance[:, 1] / np.where(spacing > 0, spacing, 1.0))
@@ -164,6 +168,36 @@ def jumps(radius: np.ndarray, neighbours: np.ndarray) -> np.ndarray:
     """
     there = radius[np.where(neighbours >= 0, neighbours, neighbours[:, :1])]
     return np.flatnonzero((there.min(axis=1) < radius / _JUMP) | (there.max(axis=1) > radius * _JUMP))
+
+
+_once = {"all pairs"}  # emptied by the first search
+
+
+def _searcher(points: np.ndarray) -> Any:
+    """What finds the nearest of the points: scipy's tree, but the first time, for few, what needs no import."""
+    if _once and len(points) <= _ALL_PAIRS and "scipy.spatial" not in sys.modules:
+        return _AllPairs(points)
+    return _tree(points)
+
+
+class _AllPairs:
+    """Answers as the tree does, to the last bit, but for the order of neighbours that are equally far."""
+
+    def __init__(self, points: np.ndarray) -> None:
+        self.points, self.n = points, len(points)
+
+    def query(self, centres: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
+        """Distances and numbers of the k nearest particles, (n, k)."""
+        parts = [self._nearest(centres[at : at + _ROWS], k) for at in range(0, len(centres), _ROWS)]
+        distance, index = map(np.concatenate, zip(*parts))
+        return distance, index
+
+    def _nearest(self, centres: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
+        square = sum((x[:, None] - y) ** 2 for x, y in zip(centres.T, self.points.T))
+        index = np.argpartition(square, k - 1, axis=1)[:, :k]
+        square = np.take_along_axis(square, index, axis=1)
+        order = np.argsort(square, axis=1)
+        return np.sqrt(np.take_along_axis(square, order, axis=1)), np.take_along_axis(index, order, axis=1)
 
 
 def _tree(points: np.ndarray) -> Any:
@@ -225,12 +259,12 @@ def within(points: np.ndarray, radius: Any, which: np.ndarray | None = None) -> 
     if radius.shape not in ((), (len(centres),)) or not (np.isfinite(radius) & (radius > 0)).all():
         came = f"shape {radius.shape}" if radius.ndim else f"{radius}"
         raise ValueError(f"radius: expected positive numbers, a scalar or ({len(centres)},), got {came}")
-    return _ragged(_tree(points), centres, np.broadcast_to(radius * EDGE, (len(centres),)), which)
+    return _ragged(points, centres, np.broadcast_to(radius * EDGE, (len(centres),)), which)
 
 
-def _ragged(tree, centres: np.ndarray, radius: np.ndarray, which: np.ndarray | None) -> Stencils:
+def _ragged(points: np.ndarray, centres: np.ndarray, radius: np.ndarray, which: np.ndarray | None) -> Stencils:
     """Neighbours within a radius, padded to the largest number of them."""
-    lists = tree.query_ball_point(centres, radius)
+    lists = _tree(points).query_ball_point(centres, radius)
     counts = np.array([len(row) for row in lists])
     index = np.full((len(centres), counts.max()), -1, np.int32)
     index[np.arange(counts.max()) < counts[:, None]] = np.concatenate([np.sort(row) for row in lists])

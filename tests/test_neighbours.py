@@ -160,3 +160,22 @@ def test_a_support_that_reaches_outside_of_the_given_stencils_is_reported():
 
     assert told(5, 3.5)
     assert not told(5, 2.0) and not told(12, 20.0)
+
+
+@pytest.mark.parametrize("dim", [1, 2, 3])
+def test_all_pairs_answer_as_the_tree_does(dim):
+    points = np.random.default_rng(dim).random((300, dim))
+    centres = points[:130]  # more than one piece of rows
+    distance, index = room._AllPairs(points).query(centres, 20)
+    expected = room._tree(points).query(centres, 20)
+    np.testing.assert_array_equal(distance, expected[0])
+    np.testing.assert_array_equal(index, expected[1])
+
+
+def test_the_first_search_of_a_process_gives_the_same_stencils(monkeypatch):
+    cloud = js.rectangle((0, 0), (1, 1), (9, 8))  # a lattice, with neighbours equally far
+    expected = js.stencils(cloud, size=9)
+    monkeypatch.setattr(room, "_searcher", room._AllPairs)
+    found = js.stencils(cloud, size=9)
+    np.testing.assert_array_equal(np.sort(found.indices), np.sort(expected.indices))
+    np.testing.assert_array_equal(found.radius, expected.radius)
