@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial, wraps
+from inspect import signature
 from typing import Any, NamedTuple
 
 import jax
@@ -16,11 +17,11 @@ import numpy as np
 
 from jsmitsm import closure, moments
 from jsmitsm.closure import Recovery
+from jsmitsm.eager import called, in_one_program
 from jsmitsm.kernels import Kernel
 from jsmitsm.moments import Block, Elimination, Row, Scheme, Support
-from jsmitsm.program import in_one_program
 from jsmitsm.recursion import row_lifts
-from jsmitsm.tracers import is_traced, recorded
+from jsmitsm.tracers import recorded
 
 # Particles per block: larger blocks leave the cache and are several times slower; in one of a power of two, rows of
 # the small matrices fall on the same lines of the cache.
@@ -102,8 +103,7 @@ def _cut(tree: Any, m: int) -> Any:
 def _in_size_classes(function: Any) -> Any:
     """Compile ``function(scheme, points, kernel, ids, neighbours, operands, each, whole)``, and call it
     with every particle axis padded: that of ``ids``, and that of the cloud."""
-    program = jax.jit(function, static_argnums=(0,))
-    on_cpu = [(most, jax.jit(function, static_argnums=(0,), compiler_options=options)) for most, options in _EFFORT]
+    inner, names = jax.jit(function, static_argnames="scheme"), list(signature(function).parameters)[1:]
 
     @wraps(function)
     def padded(scheme, points, kernel, ids, neighbours, operands, each=(), whole=()):
@@ -115,18 +115,13 @@ def _in_size_classes(function: Any) -> Any:
             (ids, neighbours, None if one_for_all else jac, operands.own, each), m, size
         )
         given = Operands(operands.jac if one_for_all else jac, own, data, operands.shared, operands.lengths)
-        arguments = points, kernel, ids, neighbours, given, each, whole
-        run = program
-        if jax.default_backend() == "cpu" and not _inside(arguments):
-            run = next(some for most, some in on_cpu if size <= most)
-        return _cut(run(scheme, *arguments), m)
+        arguments = dict(zip(names, (points, kernel, ids, neighbours, given, each, whole)))
+        if recorded():
+            return _cut(inner(scheme, **arguments), m)
+        options = next(some for most, some in _EFFORT if size <= most) if jax.default_backend() == "cpu" else {}
+        return _cut(called(function, {"scheme": scheme}, arguments, tuple(options.items())), m)
 
     return padded
-
-
-def _inside(arguments: Any) -> bool:
-    """Whether the call is part of a larger program: an inner one has no compiler options of its own."""
-    return recorded() or is_traced(arguments)
 
 
 @_in_size_classes

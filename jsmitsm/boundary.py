@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm.clouds import INTERIOR, Cloud
+from jsmitsm.eager import in_one_program, picked
 from jsmitsm.problem import Condition, Problem
-from jsmitsm.program import in_one_program, picked
 from jsmitsm.taylor import Slot
 from jsmitsm.trace import Traced, trace
 from jsmitsm.tracers import is_traced

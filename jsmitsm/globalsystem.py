@@ -8,10 +8,10 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from jsmitsm.eager import in_one_program
 from jsmitsm.layout import Class, Discretization
 from jsmitsm.moments import Row
 from jsmitsm.numbers import Numbers
-from jsmitsm.program import in_one_program
 from jsmitsm.rows import right_sides
 from jsmitsm.tracers import is_traced
 

@@ -9,12 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm import assembly
+from jsmitsm.eager import in_one_program
 from jsmitsm.globalsystem import joined
 from jsmitsm.layout import Class, Discretization, sorted_classes, table
 from jsmitsm.moments import Block
 from jsmitsm.neighbours import Stencils
 from jsmitsm.numbers import Numbers
-from jsmitsm.program import in_one_program
 from jsmitsm.progress import each
 from jsmitsm.rows import operands, pieces, right_sides, shared_elimination
 from jsmitsm.tracers import is_traced

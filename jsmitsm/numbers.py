@@ -6,14 +6,13 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm.boundary import merged
+from jsmitsm.eager import in_one_program, picked
 from jsmitsm.layout import Discretization, closed
 from jsmitsm.problem import Problem
-from jsmitsm.program import in_one_program, picked
 from jsmitsm.recursion import Recursion, source_rows
 from jsmitsm.series import Ring, mul
 from jsmitsm.taylor import Slot, factorial, index_of, multi_indices
@@ -163,17 +162,14 @@ def _data_numbers(disc: Discretization, taylor: Any) -> tuple[Any, Any]:
     return _filled(np.zeros((*shape, len(scheme.data))), data), _filled(np.zeros(shape), gamma)
 
 
+@in_one_program
 def _filled(array: Any, places: list[tuple[Any, Any]]) -> Any:
-    """array[index] = value for every pair of ``places``; in place where all are concrete."""
-    if isinstance(array, np.ndarray) and not is_traced(places):
+    """A copy of the array with array[index] = value for every pair of ``places``."""
+    if is_traced(array, places):
         for index, value in places:
-            array[index] = np.asarray(value)
+            array = jnp.asarray(array).at[index].set(value)
         return array
-    return _set_each(array, places)
-
-
-@jax.jit
-def _set_each(array: Any, places: list[tuple[Any, Any]]) -> Any:
+    array = np.array(array)
     for index, value in places:
-        array = array.at[index].set(value)
+        array[index] = np.asarray(value)
     return array

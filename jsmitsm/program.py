@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict
 from collections.abc import Callable
-from functools import wraps
 from typing import Any
 
 import jax
@@ -13,7 +12,6 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
 from jsmitsm.jaxprs import derivative
-from jsmitsm.tracers import is_traced
 
 _KEPT = 256
 _programs: OrderedDict[Any, Any] = OrderedDict()
@@ -33,25 +31,6 @@ def kept(key: Any, make: Callable[[], Any]) -> Any:
         if len(_programs) > _KEPT:
             _programs.popitem(last=False)
     return made
-
-
-def in_one_program(function: Callable[..., Any], static: tuple[str, ...] = ()) -> Callable[..., Any]:
-    """``function`` as it stands, for numbers; compiled as a whole where an argument of it is traced.
-
-    Under an eager jax.grad or jax.vmap each operation is otherwise a program of its own, compiled for every
-    shape, and so is what differentiates it: a hundred of them take ten times as long as the local phase.
-    """
-    program = jax.jit(function, static_argnames=static)
-
-    @wraps(function)
-    def run(*arguments: Any, **named: Any) -> Any:
-        traced = is_traced(arguments, named)
-        return (program if traced else function)(*arguments, **named)
-
-    return run
-
-
-picked = in_one_program(lambda values, index: values[index])
 
 
 def fingerprint(jaxpr: Any, rules: bool = True) -> Any:

@@ -25,7 +25,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jsmitsm.program import in_one_program
+from jsmitsm.eager import in_one_program
 from jsmitsm.smallsolve import general_inverse
 from jsmitsm.taylor import Slot, factorial, index_of, multi_indices
 

@@ -13,12 +13,12 @@ import numpy as np
 
 from jsmitsm import assembly, moments
 from jsmitsm.assembly import Operands
+from jsmitsm.eager import in_one_program
 from jsmitsm.kernels import Kernel
 from jsmitsm.layout import Class, Discretization
 from jsmitsm.moments import Elimination, Row
 from jsmitsm.neighbours import nearest, within
 from jsmitsm.numbers import Numbers
-from jsmitsm.program import in_one_program
 from jsmitsm.progress import each, shown
 from jsmitsm.repeats import repeats
 from jsmitsm.supports import default_kernel

@@ -15,6 +15,7 @@ from jax.extend.core import Literal
 
 from jsmitsm import abstract
 from jsmitsm.abstract import EXTRAS, FIELD, JUMPS, POINT, Facts
+from jsmitsm.eager import in_one_program
 from jsmitsm.jaxprs import EVERYTHING, NOTHING, levels
 from jsmitsm.jets import evaluate, plain
 from jsmitsm.linearize import Record, record
@@ -113,7 +114,10 @@ class Traced:
         inputs = inputs.only(read)
         if is_traced(inputs):
             return self._compiled(inputs, degree, jac, res)
-        inputs = jax.tree.map(np.asarray, inputs)
+        return self._on_host(jax.tree.map(np.asarray, inputs), degree, jac, res)
+
+    def _on_host(self, inputs: _Inputs, degree: int, jac: bool, res: bool) -> tuple[Any, Any]:
+        """In numpy, some particles at a time."""
         n = len(inputs.points)
         size = max(CHUNK // self._width, CHUNK // 8, 1)
         parts = [self._series(inputs.chunk(low, size), degree, jac, res) for low in range(0, max(n, 1), size)]
@@ -203,12 +207,15 @@ class Traced:
         moving = inputs._replace(consts=[None if k in static else c for k, c in enumerate(inputs.consts)])
 
         def compute(moving: _Inputs) -> tuple[Any, Any]:
+            consts = [static.get(k, c) for k, c in enumerate(moving.consts)]
+            given = moving._replace(consts=consts)
+            if not is_traced(given):
+                return self._on_host(given, degree, jac, res)
             global COMPILATIONS
             COMPILATIONS += 1
-            consts = [static.get(k, c) for k, c in enumerate(moving.consts)]
-            return self._series(moving._replace(consts=consts), degree, jac, res)
+            return self._series(given, degree, jac, res)
 
-        return kept(key, lambda: jax.jit(compute))(moving)
+        return kept(key, lambda: in_one_program(compute))(moving)
 
 
 @jax.tree_util.register_pytree_node_class

@@ -8,6 +8,8 @@ import pickle
 import subprocess
 import sys
 
+import logging
+
 import jax
 import jax.numpy as jnp
 import manufactured as mm
@@ -298,6 +300,60 @@ def test_new_params_compile_nothing(compiled):
     second = js.solve(problem.replace(params={"k": 3.0, "s": -1.0}), CLOUD)
     assert np.abs(np.asarray(first.u) - np.asarray(second.u)).max() > 0.1
     assert assembly.TRACES == traces and compiled.count == before
+
+
+def total(cloud, near):
+    """A function of every kind of number, which an eager gradient is asked of."""
+
+    def value(t):
+        pde = lambda u, x, p: js.divergence(lambda y: (1.0 + p * y[0]) * js.grad(u)(y))(x) - jnp.sin(x[0])
+        problem = js.Problem(pde, {"left": js.dirichlet(t["wall"]), "right": js.robin(1.0, 1.0, t["wall"])}, params=t["k"])
+        kernel = js.SuperGaussian(t["h"], t["d"])
+        sol = js.solve(problem, cloud.replace(points=t["points"]), order=3, kernel=kernel, stencils=near, solver="sparse")
+        return jnp.sum(sol.u**2)
+
+    return value
+
+
+def given(cloud, factor=1.0):
+    h = 2.4 / (len(cloud) - 1)
+    return {"h": factor * h, "d": 3.0, "k": 0.3 * factor, "wall": 0.5 * factor, "points": cloud.points}
+
+
+@pytest.fixture(scope="module")
+def graded():
+    """The programs of a first gradient."""
+    near = js.stencils(CLOUD, size=9)
+    return near, jax.grad(total(CLOUD, near))(given(CLOUD))
+
+
+@pytest.mark.parametrize("cloud", [CLOUD, stirred(CLOUD, 3)], ids=["other numbers", "other particles"])
+def test_a_second_eager_gradient_compiles_nothing(graded, compiled, cloud):
+    near, first = graded
+    before, traces = compiled.count, dict(assembly.TRACES)
+    second = jax.grad(total(cloud, near))(given(cloud, 1.01))
+    assert assembly.TRACES == traces and compiled.count == before
+    assert abs(first["k"] - second["k"]) > 1e-6, "the same numbers: nothing was tested"
+
+
+def test_a_gradient_on_a_cloud_of_similar_size_reuses_the_local_phase(graded):
+    """Its derivative too: what is compiled is small, for the exact shapes of the global system."""
+    cloud = mm.jittered(1, len(CLOUD) + 1, seed=5)
+    assert assembly.padded_size(len(cloud)) == assembly.padded_size(len(CLOUD))
+    names = []
+    logger = logging.getLogger("jax._src.interpreters.pxla")
+    handler = logging.Handler()
+    handler.emit = lambda record: names.append(record.getMessage())
+    logger.addHandler(handler)
+    traces = dict(assembly.TRACES)
+    try:
+        with jax.log_compiles():
+            jax.grad(total(cloud, js.stencils(cloud, size=9)))(given(cloud))
+    finally:
+        logger.removeHandler(handler)
+    assert assembly.TRACES == traces
+    assert any("Compiling jit(pulled_moved__entries)" in name for name in names), "nothing was listened to"
+    assert not [name for name in names if "rows)" in name]
 
 
 def test_the_counter_of_compilations_works(compiled):
