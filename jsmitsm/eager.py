@@ -80,7 +80,8 @@ class Program:
         part.__name__ = name
         if options is None:
             options = tuple(_LITTLE.items()) if jax.default_backend() == "cpu" else ()
-        self.part, self.compiled = part, jax.jit(part, compiler_options=dict(options))
+        function.__name__ = name
+        self.part, self.compiled = part, jax.jit(function, compiler_options=dict(options))
 
     def run(self, *arguments: Any) -> Any:
         if self.on_host:
