@@ -139,6 +139,12 @@ def _condition(run: Any, values: np.ndarray, nums: Any, out: list[str], found: d
             "operator is near a resonance, particles nearly coincide, or the supports couple them badly."
         )
     if run.rows is None:
+        found["round_off"] = float(np.finfo(float).eps) * found["condition"]
+        if found["round_off"] > ROUND_OFF:
+            out.append(
+                f"Round-off may reach {found['round_off']:.0e} of the solution: the least-squares form squares the "
+                'operator; take fewer particles, or formulation="loo".'
+            )
         return
     defect = max(float(np.max(np.asarray(row.defect), initial=0.0)) for row in run.rows[1])
     found["round_off"] = defect * found["condition"]

@@ -199,19 +199,19 @@ def table(disc: Discretization) -> Any:
 def _conditions_layout(groups: list[Group], rec: Recursion) -> dict[str, Any]:
     """The slots of all own conditions, and of those that only neighbours can use.
 
-    Where a group's values are all held, no equation of its own carries its other conditions
-    (the slope of a clamped plate): they are data for the neighbours.
+    A particle has one equation for every field. What a group has more than that (the slope of a clamped plate, whose
+    values are held, the moment beside the shear force of a free end) reaches the others as data of the neighbours.
     """
     zero = (0,) * rec.dim
     own = tuple(dict.fromkeys(slot for g in groups for slot in [*((k, zero) for k in g.held), *g.slots]))
-    shut = [g for g in groups if closed(g, rec)]
-    data = tuple(dict.fromkeys(slot for g in shut for slot in g.slots))
-    return {"own": own, "data": data, "n_data": max((g.n_rows for g in shut), default=0)}
+    passed = [g for g in groups if crowded(g, rec)]
+    data = tuple(dict.fromkeys(slot for g in passed for slot in g.slots))
+    return {"own": own, "data": data, "n_data": max((g.n_rows for g in passed), default=0)}
 
 
-def closed(group: Group, rec: Recursion) -> bool:
-    """Whether all values of a group are held and yet more conditions are given."""
-    return len(group.held) == rec.fields and bool(group.parts)
+def crowded(group: Group, rec: Recursion) -> bool:
+    """Whether a group has more conditions than its particles have equations to carry them."""
+    return bool(group.parts) and len(group.held) + group.n_rows > rec.fields
 
 
 def _traced(problem: Problem, dim: int) -> Traced:

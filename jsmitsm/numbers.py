@@ -11,7 +11,7 @@ import numpy as np
 
 from jsmitsm.boundary import merged
 from jsmitsm.eager import in_one_program, picked
-from jsmitsm.layout import Discretization, closed
+from jsmitsm.layout import Discretization, crowded
 from jsmitsm.problem import Problem
 from jsmitsm.recursion import Recursion, source_rows
 from jsmitsm.series import Ring, mul
@@ -153,7 +153,7 @@ def _data_numbers(disc: Discretization, taylor: Any) -> tuple[Any, Any]:
     data: list[Any] = []
     gamma: list[Any] = []
     for group in disc.groups:
-        if closed(group, disc.rec):
+        if crowded(group, disc.rec):
             coef, value = merged(group, scheme.data, _slot_values(scheme.data, disc.rec, taylor, group.ids))
             index = (group.ids[:, None], np.arange(coef.shape[1])[None, :])
             data.append((index, coef))
