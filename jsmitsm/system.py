@@ -94,10 +94,12 @@ class Run:
                 bad,
             )
         elif len(bad):
+            single = any(np.asarray(row.weights).dtype == np.float32 for row in rows)
             self.fail(
                 f"the moment systems of {len(bad)} particle(s) do not determine the solution, first {some(bad)}: too "
-                "few neighbours, or neighbours in a special position; widen the support (h, d or stencils), lower "
-                "the order, or move the particles",
+                "few neighbours, or neighbours in a special position; "
+                + ('enable float64 with jax.config.update("jax_enable_x64", True), ' if single else "")
+                + "widen the support (h, d or stencils), lower the order, or move the particles",
                 bad,
             )
         return classes, rows

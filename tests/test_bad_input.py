@@ -521,3 +521,11 @@ def test_without_x64_the_answer_is_right_to_single_precision(method):
     with jax.enable_x64(False):
         sol = js.solve(js.Problem(poisson, ENDS), LINE, method=method, kernel=None if method == "S" else KERNEL)
         assert sol.converged and np.abs(np.asarray(sol.u) - PARABOLA(LINE.points[:, 0])).max() < 1e-4
+
+
+def test_moment_systems_lost_to_float32_ask_for_float64():
+    held = dict.fromkeys(("left", "right", "bottom", "top"), js.dirichlet(lambda x: x[0]))
+    with jax.enable_x64(False):
+        cloud = js.rectangle((0, 0), (1, 1), (13, 13), jitter=0.3)
+        with pytest.raises(js.SolveError, match="do not determine.*enable float64 with"):
+            js.solve(js.Problem(lambda u, x: js.laplacian(u)(x), held), cloud, order=11)
