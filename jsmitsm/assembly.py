@@ -21,7 +21,7 @@ from jsmitsm.eager import called, in_one_program
 from jsmitsm.kernels import Kernel
 from jsmitsm.moments import Block, Elimination, Row, Scheme, Support
 from jsmitsm.recursion import row_lifts
-from jsmitsm.tracers import recorded
+from jsmitsm.tracers import closes_over_traced, recorded
 
 # Particles per block: larger blocks leave the cache and are several times slower; in one of a power of two, rows of
 # the small matrices fall on the same lines of the cache.
@@ -116,7 +116,7 @@ def _in_size_classes(function: Any) -> Any:
         )
         given = Operands(operands.jac if one_for_all else jac, own, data, operands.shared, operands.lengths)
         arguments = dict(zip(names, (points, kernel, ids, neighbours, given, each, whole)))
-        if recorded():
+        if recorded() or (kernel is not None and closes_over_traced(kernel.tree_flatten()[1])):
             return _cut(inner(scheme, **arguments), m)
         options = next(some for most, some in _EFFORT if size <= most) if jax.default_backend() == "cpu" else {}
         return _cut(called(function, {"scheme": scheme}, arguments, tuple(options.items())), m)

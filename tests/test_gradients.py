@@ -215,6 +215,24 @@ def test_values_that_the_pde_closes_over(line):
     assert float(jax.grad(f)(1.3)) == pytest.approx(difference(f, 1.3, 1.0), rel=BOUND)
 
 
+@pytest.mark.parametrize("names", [("decay",), ("decay", "h")])
+def test_values_that_a_profile_closes_over(line, names):
+    """As what it is given in ``params``, whether other numbers are traced or not."""
+
+    def f(t, kernel):
+        return jnp.sum(line.weights * js.solve(line.problem(line.theta), line.cloud, kernel=kernel(t), stencils=line.stencils).u ** 2)
+
+    closed = lambda t: js.Kernel(lambda r: jnp.exp(-t["decay"] * r**2), t["h"], 3.0)
+    given = lambda t: js.Kernel(lambda r, a: jnp.exp(-a * r**2), t["h"], 3.0, t["decay"])
+    numbers = {"decay": 1.1, "h": line.theta["h"]}
+    slopes = [
+        jax.grad(lambda some, make=make: f({**numbers, **some}, make))({name: numbers[name] for name in names})
+        for make in (closed, given)
+    ]
+    for name in names:
+        assert float(slopes[0][name]) == pytest.approx(float(slopes[1][name]), rel=1e-9)
+
+
 # ------------------------------------------------------------------ every output of a solution
 
 PLACES = np.array([[0.21], [0.68]])
