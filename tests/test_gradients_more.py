@@ -1,0 +1,109 @@
+"""Derivatives of what test_gradients.py leaves out: nonlinear problems by every method, estimates, systems.
+
+Central differences of fourth order as there, of one weighted sum of everything: with a step of 5e-5 an exact
+gradient agrees to 1e-6 of the sum's own size, the rounding of the differences included.
+"""
+
+import jax
+import jax.numpy as jnp
+import manufactured as mm
+import numpy as np
+import pytest
+from test_gradients import BOUND, Case, bent, difference, pair, turned
+
+import jsmitsm as js
+
+
+@pytest.fixture(scope="module")
+def line():
+    return Case(1, 9, 3, 3.6)
+
+
+def solved(case, t, problem, method, form="auto"):
+    return js.solve(
+        problem(t), case.moved(t), method=method, order=3, formulation=form,
+        kernel=js.SuperGaussian(h=t["h"], d=t["d"]), stencils=case.stencils,
+    )  # fmt: skip
+
+
+def check(f, theta, names):
+    """One eager gradient, along a direction of every name, against differences on the host."""
+    size = abs(float(f(theta)))
+    gradient = jax.grad(lambda some: f({**theta, **some}))({name: theta[name] for name in names})
+    rng = np.random.default_rng(7)
+    for name in names:
+        moved = rng.uniform(-1, 1, np.shape(theta[name]))
+        direction = {k: moved if k == name else np.zeros(np.shape(v)) for k, v in theta.items()}
+        measured = difference(f, theta, direction)
+        exact = float(np.sum(np.asarray(gradient[name]) * moved))
+        assert abs(exact - measured) <= BOUND * max(abs(measured), size), name
+        assert abs(measured) > 100 * BOUND * size, f"{name} moves next to nothing: nothing was tested"
+
+
+def away(case, values):
+    """Weighted squares, so that no entry hides another."""
+    return jnp.sum(case.weights.reshape(-1, *[1] * (values.ndim - 1)) * values**2)
+
+
+@pytest.mark.parametrize("method, form", [("I", "loo"), ("II", "loo"), ("III", "loo"), ("SSPH", "loo"), ("S", "lsq")])
+def test_newtons_method_by_every_method(line, method, form):
+    check(lambda t: away(line, solved(line, t, bent, method, form).u), line.theta, ("source", "wall", "points"))
+
+
+@pytest.mark.parametrize("method, form", [("II", "loo"), ("S", "lsq")])
+def test_error_estimates_of_other_methods(line, method, form):
+    estimate = lambda t: away(line, solved(line, t, line.problem, method, form).error_estimate())
+    check(estimate, line.theta, ("h", "source", "wall", "points"))
+
+
+def test_the_error_estimate_of_a_system(line):
+    check(lambda t: away(line, solved(line, t, pair, "S").error_estimate()), line.theta, ("h", "wall", "points"))
+
+
+def bent_pair(t):
+    """Two fields that multiply each other."""
+
+    def pde(u, x, p):
+        one = js.laplacian(u[0])(x) - p["reaction"] * u[0](x) * u[1](x) - p["source"]
+        return jnp.stack([one, js.laplacian(u[1])(x) + u[0](x) ** 2 - x[0]])
+
+    bcs = {"left": js.robin(t["robin_a"], t["robin_b"], t["robin_value"]), "right": js.dirichlet(t["wall"][0])}
+    return js.Problem(pde, bcs, fields=2, params={k: t[k] for k in ("source", "reaction")})
+
+
+def test_a_nonlinear_system(line):
+    f = lambda t: away(line, solved(line, t, bent_pair, "S").u)
+    check(f, line.theta, ("h", "source", "reaction", "wall", "robin_a", "points"))
+
+
+def elastic(t):
+    """An elastic square that slips along its left side, is pulled at its right one, and held below."""
+
+    def pde(u, x, p):
+        stress = lambda y: js.grad(u)(y) + js.grad(u)(y).T + p * jnp.trace(js.grad(u)(y)) * jnp.eye(2)
+        return js.divergence(stress)(x) + jnp.array([0.0, 1.0])
+
+    def traction(u, x, n, p):
+        stress = js.grad(u)(x) + js.grad(u)(x).T + p * jnp.trace(js.grad(u)(x)) * jnp.eye(2)
+        return stress @ n - jnp.array([0.3, 0.1 * x[1]])
+
+    def slip(u, x, n, p):
+        tangent = jnp.array([-n[1], n[0]])
+        return jnp.stack([u(x) @ n - 0.1, tangent @ (js.grad(u)(x) + js.grad(u)(x).T) @ n])
+
+    bcs = {"left": js.condition(slip), "right": js.condition(traction), "bottom": js.dirichlet(0.0), "top": js.dirichlet(0.2)}
+    return js.Problem(pde, bcs, fields=2, params=t["modulus"])
+
+
+def test_traction_and_slip_with_respect_to_normals():
+    """The angle turns every normal; the points move by themselves."""
+    cloud = mm.jittered(2, 5, jitter=0.2)
+    near = js.stencils(cloud, size=14)
+    theta = {"h": 0.3, "modulus": 1.3, "points": cloud.points, "tilt": 0.0}
+    weights = np.cos(3.0 * cloud.points.sum(axis=1))[:, None] + 0.5
+
+    def f(t):
+        kernel = js.Gaussian(h=t["h"], d=10.0)
+        return jnp.sum(weights * js.solve(elastic(t), turned(cloud, t), order=2, kernel=kernel, stencils=near).u ** 2)
+
+    check(f, theta, ("h", "modulus", "points", "tilt"))
