@@ -300,6 +300,8 @@ def _a_kind(what: Any, kinds: tuple[type, ...], name: str) -> Any:
     if not isinstance(what, kinds):
         wanted = " or ".join(f"js.{kind.__name__}" for kind in kinds)
         raise ValueError(f"{name}: expected a {wanted}, got {type(what).__name__}")
+    if isinstance(what, Solution):
+        what.refuse_stacked()
     return what
 
 

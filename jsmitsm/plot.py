@@ -114,6 +114,7 @@ def solution(sol: Solution, *, field: int = 0, exact: Any = None, at: Mapping[st
     """
     if not isinstance(sol, Solution):
         raise ValueError(f"sol: expected a js.Solution, got {type(sol).__name__}; plain numbers are for js.plot.values")
+    sol.refuse_stacked()
     numbers = drawing.field_of(sol.u, field)
 
     def anywhere(points):
@@ -181,6 +182,7 @@ def error(sol: Solution, exact: Any, *, field: int = 0, log: bool = True, ax: An
     ...                      {"left": js.dirichlet(0.0), "right": js.dirichlet(1.0)})
     >>> ax = js.plot.error(js.solve(problem, js.interval(0.0, 1.0, 9), order=2), lambda x: x[0] ** 4)
     """
+    sol.refuse_stacked()
     truth = drawing.at_points(exact, np.asarray(sol.cloud.points)) if callable(exact) else exact
     truth = drawing.field_of(drawing.real("exact", truth), field)
     if truth.shape != (len(sol.cloud),):

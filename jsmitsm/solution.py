@@ -95,7 +95,17 @@ class Solution:
     @property
     def u(self) -> Any:
         """Values (N,) at the particles, in the cloud's order; (N, F) for a system."""
-        return self._values[:, 0] if self._recipe.fields == 1 else self._values
+        return self._values[..., 0] if self._recipe.fields == 1 else self._values
+
+    def refuse_stacked(self) -> None:
+        """Several solutions that came out of jax.vmap as one have values, and nothing else in common."""
+        stack = jnp.shape(self._values)[:-2]
+        if stack:
+            raise ValueError(
+                f"this Solution is a stack of {'x'.join(map(str, stack))} that came out of jax.vmap, of which only u "
+                "and converged can be read: ask inside the mapped function, or take one, "
+                "jax.tree.map(lambda x: x[0], sol)"
+            )
 
     @property
     def coefficients(self) -> Any:
@@ -106,6 +116,7 @@ class Solution:
     @property
     def _taylor(self) -> Any:
         """Taylor coefficients (N, F, K)."""
+        self.refuse_stacked()
         if self._fitted is None:
             fitted = self._fit.coefficients(self._values)
             if is_traced(fitted):
@@ -122,6 +133,7 @@ class Solution:
 
         Raises ValueError for points of another shape, NaN or infinite ones.
         """
+        self.refuse_stacked()
         return self.derivative(points, (0,) * self.cloud.dim, blend=blend)
 
     def grad(self, points: Any, *, blend: bool = False) -> Any:
@@ -129,6 +141,7 @@ class Solution:
 
         Raises ValueError for points of another shape, NaN or infinite ones.
         """
+        self.refuse_stacked()
         unit = np.eye(self.cloud.dim, dtype=int)
         return jnp.stack([self.derivative(points, tuple(map(int, b)), blend=blend) for b in unit], axis=-1)
 
@@ -137,6 +150,7 @@ class Solution:
 
         With ``blend`` the polynomials' derivatives are averaged. Raises ValueError for wrong points or orders.
         """
+        self.refuse_stacked()
         points = _checked_points(points, self.cloud.dim)
         whole = isinstance(multi_index, (tuple, list)) and all(isinstance(v, (int, np.integer)) for v in multi_index)
         b = tuple(map(int, multi_index)) if whole else ()
@@ -156,6 +170,7 @@ class Solution:
         """
         from jsmitsm.boundary_quadrature import quadrature
 
+        self.refuse_stacked()
         points, weights, _ = quadrature(self.cloud, group)
         return jnp.tensordot(weights, self(points), axes=1)
 
@@ -168,6 +183,7 @@ class Solution:
         """
         from jsmitsm.boundary_quadrature import quadrature
 
+        self.refuse_stacked()
         points, weights, normals = quadrature(self.cloud, group)
         if callable(conductivity):
             conductivity = jax.vmap(conductivity)(points)
@@ -184,6 +200,7 @@ class Solution:
         """
         from jsmitsm.estimate import error_estimate
 
+        self.refuse_stacked()
         error = error_estimate(self)
         if not is_traced(error, self._values):
             size = np.abs(self.u).max(initial=0.0) or 1.0  # no square overflows
@@ -207,6 +224,7 @@ class Solution:
         error estimate below 1 % clears it and one above 10 % confirms it (scalar linear problems of
         up to 200,000 particles). An error estimate asked for before counts as well. No flag is no proof.
         """
+        self.refuse_stacked()
         if self._found is None and self._report is not None:
             self._found = self._report.flags(self._estimated)
         large = f"The estimated error is {self._share:.0%} of the solution: refine the cloud, or change the order."
@@ -230,6 +248,7 @@ class Solution:
 
     def diagnose(self) -> str:
         """In words: how the solve went, which particles were weak and what was done."""
+        self.refuse_stacked()
         s = self.stats
         lines = [repr(self)]
         if not bool(self.converged):
@@ -245,7 +264,7 @@ class Solution:
 
     def __repr__(self) -> str:
         shape = "x".join(map(str, self.u.shape))
-        state = "" if is_traced(self.converged) else f", converged={bool(self.converged)}"
+        state = "" if is_traced(self.converged) else f", converged={bool(np.all(self.converged))}"
         return f"Solution(u: {shape}, method={self.method!r}, order={self.order}{state})"
 
     def tree_flatten(self):

@@ -4,6 +4,7 @@ Each entry: a name, what is called, a pattern that names the argument, a pattern
 (or of what was expected). Both must be found in the message, ignoring case.
 """
 
+import pickle
 import re
 
 import jax
@@ -529,3 +530,39 @@ def test_moment_systems_lost_to_float32_ask_for_float64():
         cloud = js.rectangle((0, 0), (1, 1), (13, 13), jitter=0.3)
         with pytest.raises(js.SolveError, match="do not determine.*enable float64 with"):
             js.solve(js.Problem(lambda u, x: js.laplacian(u)(x), held), cloud, order=11)
+
+
+STACKED = {
+    "values": lambda sol: sol([[0.3]]),
+    "slopes": lambda sol: sol.grad([[0.3]]),
+    "coefficients": lambda sol: sol.coefficients,
+    "an estimate": lambda sol: sol.error_estimate(),
+    "a flux": lambda sol: sol.flux("left"),
+    "a diagnosis": lambda sol: sol.diagnose(),
+    "flags": lambda sol: sol.flags,
+    "a picture": lambda sol: js.plot.solution(sol),
+    "a file": lambda sol: pickle.dumps(sol),
+    "a table": lambda sol: js.files.to_pandas(sol),
+}
+
+
+@pytest.fixture(scope="module")
+def stacked():
+    problem = js.Problem(lambda u, x, s: js.laplacian(u)(x) - s, {"left": js.dirichlet(0.0), "right": js.dirichlet(1.0)}, params=1.0)
+    alone = lambda s: js.solve(problem.replace(params=s), js.interval(0.0, 1.0, 8))
+    return alone, jax.vmap(alone)(np.array([1.0, 2.0]))
+
+
+@pytest.mark.parametrize("asked", STACKED)
+def test_a_stack_of_solutions_says_what_it_is(stacked, asked):
+    with pytest.raises(ValueError, match="stack of 2 that came out of jax.vmap.*inside the mapped function, or take one"):
+        STACKED[asked](stacked[1])
+
+
+def test_one_of_a_stack_of_solutions_is_a_solution(stacked):
+    """By the way the message names; round-off of two programs."""
+    alone, several = stacked
+    assert several.u.shape == (2, 8) and "u: 2x8" in repr(several)
+    one, same = jax.tree.map(lambda x: x[1], several), alone(2.0)
+    for ask in (lambda sol: sol.u, lambda sol: sol([[0.3]]), lambda sol: sol.error_estimate()):
+        assert np.allclose(ask(one), ask(same), rtol=0, atol=1e-13)
