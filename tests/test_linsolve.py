@@ -570,3 +570,16 @@ print(bool(jnp.isfinite(d).all()))
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
     assert done.stdout.strip() == "True", done.stderr
+
+
+def test_matrices_that_differ_in_their_entries_alone_share_the_places():
+    """As an optimisation makes them: each is found again, and the places are compared once for all."""
+    rows, cols, b = np.arange(5), np.arange(5), np.ones(5)
+    several = [solve(np.full(5, scale), rows.copy(), cols.copy(), b, n=5, solver="sparse") for scale in (1.0, 2.0, 4.0)]
+    solve(np.full(6, 1.0), np.arange(6), np.arange(6), np.ones(6), n=6, solver="sparse")
+    assert len({id(entry.pattern) for entry in factorcache._cache}) == 2
+    before = factorisations()
+    for scale, x in zip((1.0, 2.0, 4.0), several):
+        assert np.array_equal(solve(np.full(5, scale), rows, cols, b, n=5, solver="sparse"), x)
+        assert np.allclose(x, 1.0 / scale)
+    assert factorisations() == before
