@@ -29,8 +29,9 @@ def interrupted(call, after):
     def press():
         sent.append(time.perf_counter())
         os.kill(os.getpid(), signal.SIGINT)
-    # Python itself loses an interrupt that falls into the callback of a weak reference, of which JAX has many.
-    for attempt in range(3):
+    # Python itself loses an interrupt that falls into the callback of a weak reference or of a garbage collection, of
+    # which JAX has many.
+    for attempt in range(8):
         js.linsolve.clear_cache()
         threading.Timer(after, press).start()
         try:
