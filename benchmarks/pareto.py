@@ -150,9 +150,12 @@ def ours(method: str, order: int) -> Callable[[Scene, js.Cloud, Any], Callable[[
 
 def _reach(scene: Scene, cloud: js.Cloud, method: str, order: int) -> float:
     """A support radius that holds about twice as many particles as the method has unknowns."""
-    unknowns = math.comb(order + cloud.dim, cloud.dim) if method == "SSPH" else (2 * order + 1)
-    spacing = (np.prod(np.ptp(np.asarray(cloud.points), axis=0)) / len(cloud)) ** (1 / cloud.dim)
-    return 1.7 * float(spacing * math.sqrt(2 * unknowns / math.pi))
+    dim = cloud.dim
+    every = math.comb(order + dim, dim)
+    unknowns = every if method == "SSPH" else every - math.comb(order + dim - 2, dim)
+    spacing = (np.prod(np.ptp(np.asarray(cloud.points), axis=0)) / len(cloud)) ** (1 / dim)
+    ball = math.pi if dim == 2 else 4 * math.pi / 3
+    return float(spacing * (1.7**2 * 2 * unknowns / ball) ** (1 / dim))
 
 
 def theirs(run: Callable[[peers.Posed], np.ndarray]) -> Callable[[Scene, js.Cloud, Any], Callable[[js.Cloud], Any]]:
@@ -179,14 +182,13 @@ def contestants(scene: Scene, only: str) -> Iterator[tuple[str, Any]]:
 def everyone(scene: Scene) -> Iterator[tuple[str, Any]]:
     for order in scene.orders:
         yield f"S {order}", ours("S", order)
-    if scene.name in ("amoeba", "lattice"):
-        for method in ("I", "II", "III", "SSPH"):
-            yield f"{method} 4", ours(method, 4)
+    for method in ("I", "II", "III", "SSPH"):
+        yield f"{method} 4", ours(method, 4)
     for name, make in (
         ("rbf 2", lambda: peers.rbf(2)), ("rbf 4", lambda: peers.rbf(4)), ("rbf 6", lambda: peers.rbf(6)),
         ("gfdm 4", lambda: peers.gfdm),
         *([("P1", lambda: peers.elements(1)), ("P2", lambda: peers.elements(2))] if scene.name != "ball" else []),
-        *([("9-point", lambda: peers.compact)] if scene.lattice else []),
+        *([("9-point", lambda: peers.compact), ("findiff 4", lambda: peers.differences(4))] if scene.lattice else []),
         *([("updes r3", lambda: peers.dense(3, 1)), ("updes r7", lambda: peers.dense(7, 3))] if scene.name != "ball" else []),
     ):  # fmt: skip
         try:

@@ -170,6 +170,26 @@ def compact(posed: Posed) -> np.ndarray:
     return result
 
 
+def differences(accuracy: int) -> Callable[[Posed], np.ndarray]:
+    """Central differences on a lattice, one-sided at the bottom where du/dy = 0 (package findiff)."""
+    from findiff import PDE, BoundaryConditions, FinDiff
+
+    def run(posed: Posed) -> np.ndarray:
+        nx, ny = posed.lattice
+        x, y = posed.points.max(axis=0) / (nx - 1, ny - 1)
+        ordered = np.lexsort((posed.points[:, 1], posed.points[:, 0]))
+        f, u = (v[ordered].reshape(nx, ny) for v in (posed.source, posed.values))
+        given = BoundaryConditions((nx, ny))
+        given[:, 0] = FinDiff(1, y, 1, acc=accuracy), 0.0
+        given[:, -1] = given[0, :] = given[-1, :] = u
+        laplacian = FinDiff(0, x, 2, acc=accuracy) + FinDiff(1, y, 2, acc=accuracy)
+        result = np.empty(nx * ny)
+        result[ordered] = PDE(laplacian, f, given).solve().ravel()
+        return result
+
+    return run
+
+
 def dense(power: int, degree: int) -> Callable[[Posed], np.ndarray]:
     """Collocation by r^power and polynomials over all particles, dense, in JAX (package updes).
 

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import jsmitsm as js
 
+signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored from the start in a background job of a shell
 SIDES = ("left", "right", "bottom", "top")
 exact = lambda x: jnp.exp(x[0]) * jnp.sin(x[1])
 problem = js.Problem(lambda u, x: js.laplacian(u)(x), {s: js.dirichlet(exact) for s in SIDES})
