@@ -189,8 +189,8 @@ class _AllPairs:
     def query(self, centres: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
         """Distances and numbers of the k nearest particles, (n, k)."""
         parts = [self._nearest(centres[at : at + _ROWS], k) for at in range(0, len(centres), _ROWS)]
-        distance, index = map(np.concatenate, zip(*parts))
-        return distance, index
+        distances, numbers = zip(*parts)
+        return np.concatenate(distances), np.concatenate(numbers)
 
     def _nearest(self, centres: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
         square = sum((x[:, None] - y) ** 2 for x, y in zip(centres.T, self.points.T))

@@ -133,7 +133,6 @@ class Solution:
 
         Raises ValueError for points of another shape, NaN or infinite ones.
         """
-        self.refuse_stacked()
         return self.derivative(points, (0,) * self.cloud.dim, blend=blend)
 
     def grad(self, points: Any, *, blend: bool = False) -> Any:
@@ -141,7 +140,6 @@ class Solution:
 
         Raises ValueError for points of another shape, NaN or infinite ones.
         """
-        self.refuse_stacked()
         unit = np.eye(self.cloud.dim, dtype=int)
         return jnp.stack([self.derivative(points, tuple(map(int, b)), blend=blend) for b in unit], axis=-1)
 
