@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jsmitsm import closure, moments
+from jsmitsm import closure, moments, onekernel
 from jsmitsm.closure import Recovery
 from jsmitsm.eager import called, in_one_program
 from jsmitsm.kernels import Kernel
@@ -25,7 +25,7 @@ from jsmitsm.tracers import closes_over_traced, recorded
 
 # Particles per block: larger blocks leave the cache and are several times slower; in one of a power of two, rows of
 # the small matrices fall on the same lines of the cache.
-_BLOCK = 48
+_BLOCK = 40
 # So few particles are always padded to as many.
 _FEW, _VERY_FEW = 2 * _BLOCK, 16
 # Options of XLA on CPUs. Its matrix products here are too small to share among threads; threads.py does that with whole
@@ -39,6 +39,9 @@ _EFFORT = (
     (2048, _PLAIN | {"xla_backend_optimization_level": 1}),
     (np.inf, _ALONE),
 )
+# Up to so many Taylor coefficients, or so many where all share an elimination, one kernel is faster than many and
+# a library's matrix products.
+_SMALL, _SMALL_SHARED = 32, 45
 
 # How often the local phase was compiled; read by the tests.
 TRACES = {"rows": 0, "coefficients": 0}
@@ -119,7 +122,9 @@ def _in_size_classes(function: Any) -> Any:
         if recorded() or (kernel is not None and closes_over_traced(kernel.tree_flatten()[1])):
             return _cut(inner(scheme, **arguments), m)
         options = next(some for most, some in _EFFORT if size <= most) if jax.default_backend() == "cpu" else {}
-        return _cut(called(function, {"scheme": scheme}, arguments, tuple(options.items())), m)
+        most = _SMALL if operands.shared is None else _SMALL_SHARED
+        small = scheme.rec.size * scheme.rec.fields <= most and onekernel.available()
+        return _cut(called(function, {"scheme": scheme}, arguments, tuple(options.items()), small), m)
 
     return padded
 

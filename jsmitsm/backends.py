@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from jsmitsm.collector import uncollected
 from jsmitsm.progress import bar
 
 ITERATIVE = ("amg", "device amg", "ilu", "float32 factors")
@@ -54,9 +55,7 @@ class SuperLU:
     iterations, stalled = 0, False
 
     def __init__(self, matrix: Any, ordered: bool) -> None:
-        from scipy.sparse.linalg import splu
-
-        self.lu = _in_order(matrix) if ordered else splu(matrix)
+        self.lu = _in_order(matrix) if ordered else _splu(matrix)
         self.entries = self.lu.nnz
 
     def apply(self, b: np.ndarray, transpose: bool) -> np.ndarray:
@@ -66,9 +65,14 @@ class SuperLU:
 
 def _in_order(matrix: Any) -> Any:
     """SuperLU's factors of a matrix in a good order: a low threshold keeps the pivots on the diagonal."""
-    from scipy.sparse.linalg import splu
+    return _splu(matrix, permc_spec="NATURAL", diag_pivot_thresh=0.01, options={"SymmetricMode": True})
 
-    return splu(matrix, permc_spec="NATURAL", diag_pivot_thresh=0.01, options={"SymmetricMode": True})
+
+def _splu(matrix: Any, **options: Any) -> Any:
+    with uncollected():
+        from scipy.sparse.linalg import splu
+
+    return splu(matrix, **options)
 
 
 @cache

@@ -24,6 +24,8 @@ import numpy as np
 from jax.extend.core import Literal, Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
 
+from jsmitsm import onekernel
+from jsmitsm.collector import uncollected
 from jsmitsm.tracers import is_traced, recorded
 
 # Options as pairs; None: f runs as it stands, in numpy, and its derivatives are compiled with little effort.
@@ -32,10 +34,16 @@ _LITTLE: Any = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_
 _KEPT = 1024
 
 
-def called(function: Callable[..., Any], static: dict[str, Any], arguments: dict[str, Any], options: Options) -> Any:
-    """``function(**static, **arguments)`` as one program; not for calls inside of a larger one."""
+def called(
+    function: Callable[..., Any], static: dict[str, Any], arguments: dict[str, Any], options: Options,
+    small: bool = False,
+) -> Any:  # fmt: skip
+    """``function(**static, **arguments)`` as one program; not for calls inside of a larger one.
+
+    ``small``: its arrays are so small that one kernel should do it all.
+    """
     leaves, tree = jax.tree.flatten(arguments)
-    program = _whole(function, tuple(static.items()), tree, options)
+    program = _whole(function, tuple(static.items()), tree, options, small)
     if not is_traced(leaves):
         return program.run(*leaves)
     return jax.tree.unflatten(program.result(_avals(leaves)).tree, program_p.bind(*leaves, program=program))
@@ -67,8 +75,10 @@ picked = in_one_program(lambda values, index: values[index])
 class Program:
     """A function of arrays; ``base``: not a derivative of another one."""
 
-    def __init__(self, function: Callable[..., Any], name: str, options: Options, base: bool = False):
-        self.name, self.options, self.on_host = name, options, base and options is None
+    def __init__(
+        self, function: Callable[..., Any], name: str, options: Options, base: bool = False, small: bool = False
+    ):
+        self.name, self.options, self.on_host, self.small = name, options, base and options is None, small
         self.function, self.trace = function, jax.jit(function).trace
         self.results: dict[Any, Result] = {}
 
@@ -82,11 +92,25 @@ class Program:
             options = tuple(_LITTLE.items()) if jax.default_backend() == "cpu" else ()
         function.__name__ = name
         self.part, self.compiled = part, jax.jit(function, compiler_options=dict(options))
+        if small:
+            self.kernel = jax.jit(onekernel.one_kernel(function), compiler_options=dict(options) | onekernel.OPTIONS)
 
     def run(self, *arguments: Any) -> Any:
         if self.on_host:
             return self.function(*map(np.asarray, arguments))
-        return self.compiled(*arguments)
+        with uncollected():
+            return self._run(*arguments)
+
+    def _run(self, *arguments: Any) -> Any:
+        if not self.small:
+            return self.compiled(*arguments)
+        try:
+            return self.kernel(*arguments)[0]
+        except jax.errors.JaxRuntimeError as error:
+            if "UNIMPLEMENTED" not in str(error):
+                raise
+            self.small = False  # an operation that a kernel cannot hold
+            return self.compiled(*arguments)
 
     def result(self, avals: tuple[Any, ...]) -> Result:
         config: Any = jax.config
@@ -132,10 +156,12 @@ def _with(values: Sequence[Any], places: Sequence[int], new: Sequence[Any]) -> l
 
 
 @lru_cache(maxsize=_KEPT)
-def _whole(function: Callable[..., Any], static: tuple[tuple[str, Any], ...], tree: Any, options: Options) -> Program:
+def _whole(
+    function: Callable[..., Any], static: tuple[tuple[str, Any], ...], tree: Any, options: Options, small: bool
+) -> Program:
     """A function of the leaves of its arguments."""
     call = lambda *leaves: function(**dict(static), **jax.tree.unflatten(tree, leaves))  # noqa: E731
-    return Program(call, function.__name__, options, base=True)
+    return Program(call, function.__name__, options, base=True, small=small)
 
 
 @lru_cache(maxsize=_KEPT)

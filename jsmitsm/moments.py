@@ -17,7 +17,7 @@ import numpy as np
 from jsmitsm.kernels import EDGE, Kernel, fitted
 from jsmitsm.polynomials import FEW, Combinations, functionals, monomials, whitening
 from jsmitsm.recursion import Recursion, Slot, constraints, substitution
-from jsmitsm.smallsolve import general_inverse, gram_inverse, min_norm, null_space, safe_root, solve_gram
+from jsmitsm.smallsolve import general_inverse, gram_inverse, min_norm, null_space, product, safe_root, solve_gram
 from jsmitsm.taylor import multi_indices
 
 
@@ -240,7 +240,8 @@ def local_system(
         z, own_solve = null_space(own_rows @ basis)
         basis = basis @ z
         tests = None if tests is None else tests @ z
-    return System(solution, basis, own_rows, own_scale, own_solve, values, values @ basis, weights, tests, data_scale)
+    phi = values @ basis if isinstance(values, Combinations) else product(values, basis)
+    return System(solution, basis, own_rows, own_scale, own_solve, values, phi, weights, tests, data_scale)
 
 
 def moment_matrix(system: System) -> Any:

@@ -25,8 +25,9 @@ from jsmitsm.supports import default_kernel
 from jsmitsm.threads import cores, side_by_side
 from jsmitsm.tracers import is_traced, recorded
 
-# Particles that the cores share in pieces, between whose ends a progress bar moves; every piece costs a millisecond.
-PIECE, MOST_PIECES = 4096, 32
+# Particles that the cores share in pieces, between whose ends a progress bar moves. Every piece costs a millisecond, so
+# it has some four of work: _WORK entries of matrices to be made, about.
+PIECE, MOST_PIECES, _WORK = 16384, 32, 1_200_000
 # Lengths that share an elimination differ by less than this ratio; particles that each elimination must serve.
 _STEP, _WORTH = 1.25, 50
 
@@ -194,21 +195,24 @@ def _recovery_kernel(disc: Discretization) -> tuple[Kernel, Any]:
 
 def pieces(disc: Discretization, nums: Numbers, cls: Class, *more: Any) -> list[Class]:
     """A large class in pieces of one size (one program serves all), for the cores to share or a bar to move."""
-    n = len(cls.ids)
-    if n <= 2 * PIECE or not (shown() or cores() > 1):
+    n, width, columns = len(cls.ids), cls.neighbours.shape[1], cls.scheme.rec.size * cls.scheme.rec.fields
+    own_elimination = columns**3 // 4 if nums.jac.shape[-1] > 1 else 0
+    worth = min(PIECE, _WORK // (width * columns + own_elimination) + 1)
+    if n < 2 * worth or not (shown() or cores() > 1):
         return [cls]
     if recorded() or is_traced(disc.points, disc.kernel, vars(nums), cls.neighbours, more):
         return [cls]
-    count = min(-(-n // PIECE), MOST_PIECES)
-    step = -(-n // (-(-count // cores()) * cores()))  # as many pieces for each core
+    rounds = -(-min(-(-n // PIECE), MOST_PIECES) // cores())  # as many pieces for each core
+    step = max(-(-n // (rounds * cores())), worth)
     cuts = [slice(start, start + step) for start in range(0, n, step)]
     return [replace(cls, ids=cls.ids[some], neighbours=cls.neighbours[some]) for some in cuts]
 
 
-def _shared_out(what: str, disc: Discretization, cls: Class) -> Any:
+def _shared_out(what: str, disc: Discretization, cut: list[Class]) -> Any:
     """Like map, on all cores: for the pieces of a class."""
-    sizes = assembly.cloud_size(len(disc.points)), len(cls.ids) // PIECE, cls.neighbours.shape[1]
-    return partial(side_by_side, program=(what, cls.scheme, sizes, disc.kernel is None))
+    first = cut[0]
+    sizes = assembly.cloud_size(len(disc.points)), assembly.padded_size(len(first.ids)), first.neighbours.shape[1]
+    return partial(side_by_side, program=(what, first.scheme, sizes, disc.kernel is None))
 
 
 def _joined(parts: list[Any]) -> Any:
@@ -223,7 +227,8 @@ def class_rows(disc: Discretization, nums: Numbers, cls: Class, shared: Any) -> 
         given = operands(disc, nums, cls, shared)
         return assembly.rows(cls.scheme, disc.points, disc.kernel, cls.ids, cls.neighbours, given)
 
-    return _joined(each("local fits", one, pieces(disc, nums, cls), _shared_out("rows", disc, cls)))
+    cut = pieces(disc, nums, cls)
+    return _joined(each("local fits", one, cut, _shared_out("rows", disc, cut)))
 
 
 def class_moment_matrices(disc: Discretization, nums: Numbers, cls: Class, shared: Any) -> Any:
@@ -243,7 +248,7 @@ def class_coefficients(disc: Discretization, nums: Numbers, cls: Class, shared: 
         )
 
     cut = pieces(disc, nums, cls, u)
-    return _joined(each("Taylor coefficients", one, cut, _shared_out("coefficients", disc, cls)))
+    return _joined(each("Taylor coefficients", one, cut, _shared_out("coefficients", disc, cut)))
 
 
 def right_sides(disc: Discretization, nums: Numbers, cls: Class) -> tuple[Any, Any]:

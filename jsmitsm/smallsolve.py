@@ -7,12 +7,13 @@ do not run on every device; loops of rank-one updates do, and are faster at thes
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import reduce
+from functools import partial, reduce
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.custom_derivatives import SymbolicZero
 
 
 def safe_root(x: Any) -> Any:
@@ -104,8 +105,8 @@ class GramInverse(NamedTuple):
         return scale * (self.matrix @ (scale * t))
 
 
-# So many outer products are summed in one loop; up to so many rows that beats a matrix product.
-_TOGETHER, _FEW_ROWS = 18, 40
+# So many outer products are summed in one loop; up to so many in all that beats a matrix product.
+_TOGETHER, _FEW_COLUMNS, _MOST = 18, 45, 64
 
 
 def outer_products(left: Sequence[Any], right: Sequence[Any]) -> Any:
@@ -121,9 +122,25 @@ def outer_products(left: Sequence[Any], right: Sequence[Any]) -> Any:
 
 
 @jax.custom_jvp
+def product(a: Any, b: Any) -> Any:
+    """a @ b of small matrices (n, k) and (k, m)."""
+    if len(b) > _FEW_COLUMNS:
+        return a @ b
+    ones = [1] * len(b)
+    return outer_products(jax.lax.split(a.T, ones), jax.lax.split(b, ones))
+
+
+@partial(product.defjvp, symbolic_zeros=True)
+def _product_jvp(primals, tangents):
+    (a, b), (da, db) = primals, tangents
+    slopes = [x @ y for x, y in ((da, b), (a, db)) if not any(isinstance(z, SymbolicZero) for z in (x, y))]
+    return product(a, b), reduce(jax.lax.add, slopes)
+
+
+@jax.custom_jvp
 def gram_matrix(a: Any) -> Any:
     """A^T A for a tall A (n, k)."""
-    if len(a) > _FEW_ROWS:
+    if len(a) > _MOST:
         return a.T @ a
     rows = jax.lax.split(a, [1] * len(a))
     return outer_products(rows, rows)

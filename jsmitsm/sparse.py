@@ -18,6 +18,7 @@ import numpy as np
 
 from jsmitsm.backends import BACKENDS, ITERATIVE, SuperLU
 from jsmitsm.choice import DENSE_MAX, choose_backends
+from jsmitsm.collector import uncollected
 from jsmitsm.conditioning import inverse_norm, near_null_vector
 from jsmitsm.errors import SingularMatrix
 from jsmitsm.interrupts import interruptible
@@ -76,7 +77,8 @@ class Factor:
         refine: int = 1,
         order: np.ndarray | None = None,
     ) -> None:
-        from scipy import sparse
+        with uncollected():
+            from scipy import sparse
 
         data = np.asarray(data, dtype=float)
         rows, cols = np.asarray(rows), np.asarray(cols)

@@ -86,7 +86,7 @@ def test_a_result_that_does_not_move_has_no_derivative():
     """Otherwise what follows would be differentiated in vain."""
     arguments = {"index": np.array([0]), "scale": 1.5, "x": X["x"]}
     tree = jax.tree.structure(arguments)
-    result = eager._whole(plain, (("power", 3),), tree, OPTIONS).result(eager._avals(arguments.values()))
+    result = eager._whole(plain, (("power", 3),), tree, OPTIONS, False).result(eager._avals(arguments.values()))
     names = sorted(plain(*(arguments[k] for k in ("x", "scale", "index")), 3))
     reached = {name: [names[k] for k in result.reached([k])] for k, name in enumerate(arguments)}
     assert reached == {"index": ["all"], "scale": ["all", "scale"], "x": ["all"]}
