@@ -1,8 +1,8 @@
 """The local phase, microseconds a particle: ``python -m benchmarks.local``.
 
-One small system for every particle: support, moments, weights, no neighbour search and no assembly. On one core, in one
-piece on all of them (XLA shares the small loops of one program among cores, and loses by it), and in pieces side by
-side, as it is solved; for a constant operator, and for a variable one against its constant twin.
+One small system for every particle: support, moments, weights, no neighbour search and no assembly. On one core, and in
+pieces side by side on all of them, as it is solved; the same as the many kernels that XLA makes of it by itself; and for
+a variable operator against its constant twin.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import jsmitsm as js
 from benchmarks import machine
 from benchmarks.commandline import arguments
 from jsmitsm import discretize as dz
-from jsmitsm import rows
+from jsmitsm import onekernel
 from jsmitsm.solve import discretized
 
 DATA = Path(__file__).parent / "data" / "local.json"
@@ -43,7 +43,7 @@ def problem(dim: int, variable: bool) -> js.Problem:
     return js.Problem(pde, dict.fromkeys(sides, js.dirichlet(0.0)))
 
 
-def microseconds(dim: int, order: int, size: int, side: int, variable: bool, whole: bool) -> float:
+def microseconds(dim: int, order: int, size: int, side: int, variable: bool, many: bool) -> float:
     """The least of the repeats, for one particle."""
     jax.config.update("jax_enable_x64", True)
     make = js.rectangle if dim == 2 else js.box
@@ -54,8 +54,8 @@ def microseconds(dim: int, order: int, size: int, side: int, variable: bool, who
     exactly = replace(found, indices=found.indices[:, :size])
     disc = discretized(posed, cloud, "S", order, None, exactly)
     nums: Any = dz.numbers(disc, posed)
-    if whole:
-        rows.cores = lambda: 1
+    if many:
+        onekernel.available = lambda: False
     took = []
     for _ in range(REPEATS):
         start = time.perf_counter()
@@ -64,12 +64,12 @@ def microseconds(dim: int, order: int, size: int, side: int, variable: bool, who
     return 1e6 * min(took) / len(disc.active)
 
 
-def apart(case: tuple[int, ...], cores: set[int], variable: bool = False, whole: bool = False) -> float:
+def apart(case: tuple[int, ...], cores: set[int], variable: bool = False, many: bool = False) -> float:
     """The same in a process of its own, whose threads have never known other cores."""
     mine = os.sched_getaffinity(0)
     os.sched_setaffinity(0, cores)  # a process starts on the cores of its parent
     try:
-        command = [sys.executable, "-m", "benchmarks.local", "--one", *map(str, case), str(int(variable)), str(int(whole))]
+        command = [sys.executable, "-m", "benchmarks.local", "--one", *map(str, case), str(int(variable)), str(int(many))]
         done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=Path(__file__).parent.parent)
     finally:
         os.sched_setaffinity(0, mine)
@@ -80,10 +80,12 @@ def main() -> None:
     about, lines = machine.describe(), []
     every = os.sched_getaffinity(0)
     for case in CASES:
-        one, variable = (apart(case, {min(every)}, variable=k) for k in (False, True))
-        whole, both = (apart(case, every, whole=k) for k in (True, False))
+        here = {min(every)}
+        one, variable, many = apart(case, here), apart(case, here, variable=True), apart(case, here, many=True)
+        both, many_both = apart(case, every), apart(case, every, many=True)
         dim, order, size, _ = case
-        cells = *(f"{x:.3g}" for x in (one, whole, both)), f"{whole / both:.2g}", f"{variable:.3g}", f"{variable / one:.2g}"
+        cells = [f"{one:.3g}", f"{both:.3g}", f"{one / both:.2g}", f"{many:.3g}", f"{many_both:.3g}"]
+        cells += [f"{variable:.3g}", f"{variable / one:.2g}"]
         lines.append([f"{dim}D", str(order), str(size), *cells])
         print(" | ".join(lines[-1]), flush=True)
     note = (
@@ -91,7 +93,7 @@ def main() -> None:
         f"of its own, on {about['processor']} (`python -m benchmarks.local`)."
     )
     all_cores = f"{about['cores']} cores"
-    columns = ["", "order", "neighbours", "one core", f"in one piece on {all_cores}", f"in pieces on {all_cores}", "gain"]
+    columns = ["", "order", "neighbours", "one core", all_cores, "gain", "many kernels, one core", f"many kernels, {all_cores}"]
     columns += ["variable coefficients, one core", "ratio"]
     made = {"columns": columns, "rows": lines, "note": note}
     DATA.write_text(json.dumps({"machine": about, "tables": {"local": made}}, indent=1) + "\n")
@@ -100,7 +102,7 @@ def main() -> None:
 if __name__ == "__main__":
     given = arguments(__doc__, "one", names="number")  # one of them: in a process of its own
     if given.one:
-        *case, variable, whole = map(int, given.names)
-        print(microseconds(*case, bool(variable), bool(whole)))
+        *case, variable, many = map(int, given.names)
+        print(microseconds(*case, bool(variable), bool(many)))
     else:
         main()

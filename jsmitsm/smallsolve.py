@@ -105,8 +105,8 @@ class GramInverse(NamedTuple):
         return scale * (self.matrix @ (scale * t))
 
 
-# So many outer products are summed in one loop; up to so many in all that beats a matrix product.
-_TOGETHER, _FEW_COLUMNS, _MOST = 18, 45, 64
+# So many outer products are summed in one loop; up to so many in a product, and in a Gram matrix, that beats a library.
+_TOGETHER, _MOST, _MOST_ROWS = 18, 45, 64
 
 
 def outer_products(left: Sequence[Any], right: Sequence[Any]) -> Any:
@@ -124,7 +124,7 @@ def outer_products(left: Sequence[Any], right: Sequence[Any]) -> Any:
 @jax.custom_jvp
 def product(a: Any, b: Any) -> Any:
     """a @ b of small matrices (n, k) and (k, m)."""
-    if len(b) > _FEW_COLUMNS:
+    if len(b) > _MOST:
         return a @ b
     ones = [1] * len(b)
     return outer_products(jax.lax.split(a.T, ones), jax.lax.split(b, ones))
@@ -140,7 +140,7 @@ def _product_jvp(primals, tangents):
 @jax.custom_jvp
 def gram_matrix(a: Any) -> Any:
     """A^T A for a tall A (n, k)."""
-    if len(a) > _MOST:
+    if len(a) > _MOST_ROWS:
         return a.T @ a
     rows = jax.lax.split(a, [1] * len(a))
     return outer_products(rows, rows)
