@@ -74,6 +74,13 @@ def padded_size(n: int) -> int:
     return -(-blocks // step) * step * _BLOCK
 
 
+def _size_at_hand(compiled: set[int], n: int) -> int:
+    """The size class of n particles, or one that is compiled already and at most a quarter too large."""
+    size = min((s for s in tuple(compiled) if n <= s <= 1.25 * n), default=padded_size(n))
+    compiled.add(size)
+    return size
+
+
 def cloud_size(n: int) -> int:
     """The size class of a cloud of n particles, which are only looked up: few programs serve all clouds."""
     return max(_FEW, 1 << (n - 1).bit_length())
@@ -107,12 +114,15 @@ def _in_size_classes(function: Any) -> Any:
     """Compile ``function(scheme, points, kernel, ids, neighbours, operands, each, whole)``, and call it
     with every particle axis padded: that of ``ids``, and that of the cloud."""
     inner, names = jax.jit(function, static_argnames="scheme"), list(signature(function).parameters)[1:]
+    compiled: dict[Any, set[int]] = {}
 
     @wraps(function)
     def padded(scheme, points, kernel, ids, neighbours, operands, each=(), whole=()):
         n, m = points.shape[0], ids.shape[0]
-        big, size = cloud_size(n), padded_size(m)
         jac, one_for_all = operands.jac, operands.jac.shape[0] == 1
+        big = cloud_size(n)
+        form = scheme, big, neighbours.shape[1], jac.shape[1:], one_for_all, operands.shared is None
+        size = _size_at_hand(compiled.setdefault(form, set()), m)
         points, kernel, data, whole = _widened((points, kernel, operands.data, whole), n, big)
         ids, neighbours, jac, own, each = _widened(
             (ids, neighbours, None if one_for_all else jac, operands.own, each), m, size

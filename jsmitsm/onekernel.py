@@ -5,12 +5,14 @@ not wait for each other. A block of particles has some hundred of them, as short
 them takes up to two fifths of the time, and more where other programs run beside. Loops over a few bytes XLA makes one
 kernel of, with all that is called inside of them, by an attribute of a call, which is set here.
 
-Such a kernel cannot call a library for its matrix products, so it is for small ones alone.
+Such a kernel cannot call a library for its matrix products, so it is for small ones alone, and they are written
+otherwise ``inside()`` of one.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextvars import ContextVar
 from typing import Any
 
 import jax
@@ -31,6 +33,14 @@ OPTIONS = {
 _CONSTANT = 8192
 
 
+_inside: ContextVar[bool] = ContextVar("inside of one kernel", default=False)
+
+
+def inside() -> bool:
+    """Whether what is traced here becomes part of one kernel."""
+    return _inside.get()
+
+
 def available() -> bool:
     """Whether this version of JAX, on this device, makes one kernel of a program."""
     return jax.default_backend() == "cpu" and jax.__version_info__[:2] in _TRIED
@@ -40,8 +50,14 @@ def one_kernel(function: Callable[..., Any]) -> Callable[..., Any]:
     """``function`` of arrays, marked to become one kernel, and its result beside numbers to be ignored."""
     from jax.experimental.xla_metadata import set_xla_metadata
 
-    # An argument that nothing uses aborts the compiler: a number of each of them is a result.
-    inner = jax.jit(lambda *arguments: (function(*arguments), _firsts(arguments)))
+    @jax.jit
+    def inner(*arguments: Any) -> tuple[Any, Any]:
+        before = _inside.set(True)
+        try:
+            # An argument that nothing uses aborts the compiler: a number of each of them is a result.
+            return function(*arguments), _firsts(arguments)
+        finally:
+            _inside.reset(before)
 
     def run(*arguments: Any) -> tuple[Any, Any]:
         made, firsts = inner(*arguments)

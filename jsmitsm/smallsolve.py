@@ -7,13 +7,14 @@ do not run on every device; loops of rank-one updates do, and are faster at thes
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial, reduce
+from functools import reduce
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.custom_derivatives import SymbolicZero
+
+from jsmitsm import onekernel
 
 
 def safe_root(x: Any) -> Any:
@@ -105,8 +106,9 @@ class GramInverse(NamedTuple):
         return scale * (self.matrix @ (scale * t))
 
 
-# So many outer products are summed in one loop; up to so many in a product, and in a Gram matrix, that beats a library.
-_TOGETHER, _MOST, _MOST_ROWS = 18, 45, 64
+# So many outer products are summed in one loop. Up to so many rows, or so many inside of one kernel, a Gram matrix is
+# faster as a sum of them than as a product.
+_TOGETHER, _FEW_ROWS, _MOST_ROWS = 18, 40, 64
 
 
 def outer_products(left: Sequence[Any], right: Sequence[Any]) -> Any:
@@ -121,26 +123,18 @@ def outer_products(left: Sequence[Any], right: Sequence[Any]) -> Any:
     return reduce(jax.lax.add, map(jax.lax.optimization_barrier, some))
 
 
-@jax.custom_jvp
 def product(a: Any, b: Any) -> Any:
     """a @ b of small matrices (n, k) and (k, m)."""
-    if len(b) > _MOST:
+    if not onekernel.inside():
         return a @ b
     ones = [1] * len(b)
     return outer_products(jax.lax.split(a.T, ones), jax.lax.split(b, ones))
 
 
-@partial(product.defjvp, symbolic_zeros=True)
-def _product_jvp(primals, tangents):
-    (a, b), (da, db) = primals, tangents
-    slopes = [x @ y for x, y in ((da, b), (a, db)) if not any(isinstance(z, SymbolicZero) for z in (x, y))]
-    return product(a, b), reduce(jax.lax.add, slopes)
-
-
 @jax.custom_jvp
 def gram_matrix(a: Any) -> Any:
     """A^T A for a tall A (n, k)."""
-    if len(a) > _MOST_ROWS:
+    if len(a) > (_MOST_ROWS if onekernel.inside() else _FEW_ROWS):
         return a.T @ a
     rows = jax.lax.split(a, [1] * len(a))
     return outer_products(rows, rows)
