@@ -85,7 +85,8 @@ def repaired(
             # One shape for all attempts: compiling costs far more than computing a few rows twice.
             left = np.resize(left, len(weak))
             near = attempt(points, best.ids[left], size)[:, :width]
-            trial = Class(best.ids[left], _widened(near, width, 1, -1), cls.scheme)
+            # And few shapes for all clouds.
+            trial = Class(best.ids[left], _widened(near, -(-width // 16) * 16, 1, -1), cls.scheme)
             best.update(left, trial.neighbours, dz.class_rows(disc, nums, trial, shared))
         keep = np.setdiff1d(np.arange(len(cls.ids)), weak)
         if len(keep):
