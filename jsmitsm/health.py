@@ -13,6 +13,7 @@ import numpy as np
 
 from jsmitsm import discretize as dz
 from jsmitsm.discretize import Class, Discretization, Numbers
+from jsmitsm.layout import rounded_width
 from jsmitsm.moments import Row
 from jsmitsm.neighbours import nearest
 
@@ -86,7 +87,7 @@ def repaired(
             left = np.resize(left, len(weak))
             near = attempt(points, best.ids[left], size)[:, :width]
             # And few shapes for all clouds.
-            trial = Class(best.ids[left], _widened(near, -(-width // 16) * 16, 1, -1), cls.scheme)
+            trial = Class(best.ids[left], _widened(near, rounded_width(width, 16), 1, -1), cls.scheme)
             best.update(left, trial.neighbours, dz.class_rows(disc, nums, trial, shared))
         keep = np.setdiff1d(np.arange(len(cls.ids)), weak)
         if len(keep):

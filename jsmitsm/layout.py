@@ -166,7 +166,7 @@ def sorted_classes(disc: Discretization, ids: np.ndarray, stencils: Stencils) ->
         counts = np.max(np.where(near[ids] >= 0, np.arange(near.shape[1]), 0), axis=1, initial=0) + 1
         narrow = int(np.sort(counts)[4 * (len(ids) - 1) // 5]) if len(ids) else 1
         wide = counts > 1.25 * narrow
-        used = [_rounded(int(counts[~wide].max(initial=1))), _rounded(near.shape[1])]
+        used = [rounded_width(int(counts[~wide].max(initial=1))), rounded_width(near.shape[1])]
         near = np.pad(near, ((0, 0), (0, max(0, max(used) - near.shape[1]))), constant_values=-1)
     classes = []
     for count in np.unique(disc.n_own[ids]):
@@ -177,9 +177,9 @@ def sorted_classes(disc: Discretization, ids: np.ndarray, stencils: Stencils) ->
     return classes
 
 
-def _rounded(width: int) -> int:
+def rounded_width(width: int, step: int = 4) -> int:
     """Widths of stencils come in steps, so that another support seldom needs another program."""
-    return width if width <= 5 else -(-width // 4) * 4
+    return width if width <= 5 else -(-width // step) * step
 
 
 def table(disc: Discretization) -> Any:

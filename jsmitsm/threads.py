@@ -6,7 +6,6 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import copy_context
-from importlib import import_module
 from typing import Any
 
 import jax
@@ -48,12 +47,9 @@ def _as_here(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
     """The function under the precision and the device of this thread, which JAX sets for each thread apart."""
     config: Any = jax.config
     wide, device = config.jax_enable_x64, config.jax_default_device
-    precision: Any = getattr(jax, "enable_x64", None)
-    if precision is None:  # JAX before 0.8
-        precision = import_module("jax.experimental").enable_x64
 
     def there(item: Any) -> Any:
-        with precision(wide), jax.default_device(device):
+        with jax.enable_x64(wide), jax.default_device(device):
             return function(item)
 
     return there
