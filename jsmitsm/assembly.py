@@ -86,6 +86,11 @@ def cloud_size(n: int) -> int:
     return max(_FEW, 1 << (n - 1).bit_length())
 
 
+def in_cloud_size(tree: Any, n: int) -> Any:
+    """Arrays of all n particles padded to the size class of the cloud; what is padded is not padded again."""
+    return _widened(tree, n, cloud_size(n))
+
+
 def _pad(x: Any, n: int, size: int) -> Any:
     """Repeat the first row until ``size`` rows, where the leading axis has n; others pass."""
     if x is None or np.ndim(x) == 0 or x.shape[0] != n or n == size:
@@ -123,7 +128,7 @@ def _in_size_classes(function: Any) -> Any:
         big = cloud_size(n)
         form = scheme, big, neighbours.shape[1], jac.shape[1:], one_for_all, operands.shared is None
         size = _size_at_hand(compiled.setdefault(form, set()), m)
-        points, kernel, data, whole = _widened((points, kernel, operands.data, whole), n, big)
+        points, kernel, data, whole = in_cloud_size((points, kernel, operands.data, whole), n)
         ids, neighbours, jac, own, each = _widened(
             (ids, neighbours, None if one_for_all else jac, operands.own, each), m, size
         )

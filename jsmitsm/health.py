@@ -68,37 +68,42 @@ def repaired(
     """
     shared = dz.shared_elimination(disc, nums)
     points = disc.images.searched(np.asarray(disc.cloud.points))
-    new_classes, new_rows, touched = [], [], []
+    new_classes, new_rows = [], []
+    poor: dict[Any, list[tuple[Class, Row]]] = {}
+    sizes: dict[Any, int] = {}
     for cls, row in zip(classes, rows):
-        lebesgue = _score(row)
-        weak = np.flatnonzero(lebesgue > LEBESGUE)
-        if not len(weak):
-            new_classes.append(cls)
-            new_rows.append(row)
-            continue
-        best = _Best(cls.ids[weak], lebesgue[weak], row, weak, cls.neighbours[weak], bool(cls.scheme.n_own))
-        size = int((cls.neighbours >= 0).sum(axis=1).max())
+        weak = _score(row) > LEBESGUE
+        form = cls.scheme, cls.neighbours.shape[1]
+        sizes[form] = max(sizes.get(form, 0), int((cls.neighbours >= 0).sum(axis=1).max()))
+        if not weak.all():
+            keep = np.flatnonzero(~weak)
+            new_classes.append(_some(cls, keep) if weak.any() else cls)
+            new_rows.append(_take(row, keep) if weak.any() else row)
+        if weak.any():  # those of all pieces of a class are repaired together
+            at = np.flatnonzero(weak)
+            poor.setdefault(form, []).append((_some(cls, at), _take(row, at)))
+    touched = [np.zeros(0, int)]
+    for form, parts in poor.items():
+        some, few = zip(*parts)
+        ids, near = (np.concatenate([getattr(cls, x) for cls in some]) for x in ("ids", "neighbours"))
+        scheme, size = form[0], sizes[form]
+        best = _Best(Row(*map(np.concatenate, zip(*few))), near, bool(scheme.n_own))
         width = min(len(points), round(2.2 * size))
         for attempt in (_wider(1.5), _wider(2.2), _balanced(1.0), _balanced(1.5), _balanced(2.2)):
             left = np.flatnonzero(best.lebesgue > LEBESGUE)
             if not len(left):
                 break
             # One shape for all attempts: compiling costs far more than computing a few rows twice.
-            left = np.resize(left, len(weak))
-            near = attempt(points, best.ids[left], size)[:, :width]
+            left = np.resize(left, len(ids))
+            tried = attempt(points, ids[left], size)[:, :width]
             # And few shapes for all clouds.
-            trial = Class(best.ids[left], _widened(near, rounded_width(width, 16), 1, -1), cls.scheme)
+            trial = Class(ids[left], _widened(tried, rounded_width(width, 16), 1, -1), scheme)
             best.update(left, trial.neighbours, dz.class_rows(disc, nums, trial, shared))
-        keep = np.setdiff1d(np.arange(len(cls.ids)), weak)
-        if len(keep):
-            new_classes.append(Class(cls.ids[keep], cls.neighbours[keep], cls.scheme))
-            new_rows.append(_take(row, keep))
-        new_classes.append(Class(best.ids, best.neighbours, cls.scheme))
+        new_classes.append(Class(ids, best.neighbours, scheme))
         new_rows.append(best.row)
-        touched.append(best.ids[best.changed])
+        touched.append(ids[best.changed])
     after = examine(new_classes, new_rows)
-    fixed = np.concatenate(touched) if touched else np.zeros(0, int)
-    return new_classes, new_rows, replace(after, repaired=fixed)
+    return new_classes, new_rows, replace(after, repaired=np.concatenate(touched))
 
 
 # Moment matrices are looked at so many at a time, as many as one small program serves.
@@ -144,13 +149,10 @@ def _score(row: Row) -> np.ndarray:
 class _Best:
     """The healthiest row found so far of every weak particle."""
 
-    def __init__(
-        self, ids: np.ndarray, lebesgue: np.ndarray, row: Row, at: np.ndarray, neighbours: np.ndarray, one_sided: bool
-    ):
-        self.one_sided = one_sided
-        self.ids, self.lebesgue, self.neighbours = ids, lebesgue.copy(), neighbours
-        self.row = _take(row, at)
-        self.changed = np.zeros(len(ids), bool)
+    def __init__(self, row: Row, neighbours: np.ndarray, one_sided: bool):
+        self.row, self.neighbours, self.one_sided = row, neighbours, one_sided
+        self.lebesgue = _score(row)
+        self.changed = np.zeros(len(neighbours), bool)
 
     def update(self, at: np.ndarray, neighbours: np.ndarray, row: Row) -> None:
         """Take over the rows of ``at`` that came out healthier."""
@@ -173,6 +175,10 @@ def _inserted(x: np.ndarray, at: np.ndarray, y: np.ndarray) -> np.ndarray:
     x = np.array(x)
     x[at] = y
     return x
+
+
+def _some(cls: Class, at: np.ndarray) -> Class:
+    return replace(cls, ids=cls.ids[at], neighbours=cls.neighbours[at])
 
 
 def _take(row: Row, at: np.ndarray) -> Row:

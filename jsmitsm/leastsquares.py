@@ -16,7 +16,7 @@ from jsmitsm.moments import Block
 from jsmitsm.neighbours import Stencils
 from jsmitsm.numbers import Numbers
 from jsmitsm.progress import each
-from jsmitsm.rows import operands, pieces, right_sides, shared_elimination
+from jsmitsm.rows import around, operands, pieces, right_sides, shared_elimination
 from jsmitsm.tracers import is_traced
 
 
@@ -67,12 +67,13 @@ def _unknown_count(disc: Discretization) -> int:
 def _fitted(disc: Discretization, nums: Numbers) -> list[Class]:
     """All particles, those with held values too, in pieces."""
     whole = sorted_classes(disc, nums.ids, Stencils(table(disc), None))
-    return [piece for cls in whole for piece in pieces(disc, nums, cls)]
+    return [piece for some in pieces(disc, nums, whole) for piece in some]
 
 
 def _class_blocks(disc: Discretization, nums: Numbers, cls: Class, shared: Any) -> Block:
-    given = operands(disc, nums, cls, shared)
-    return assembly.blocks(cls.scheme, disc.points, disc.kernel, cls.ids, cls.neighbours, given)
+    there = around(disc, nums)
+    given = operands(disc, nums, cls, shared, there.data)
+    return assembly.blocks(cls.scheme, there.points, there.kernel, cls.ids, cls.neighbours, given)
 
 
 def _right_values(disc: Discretization, nums: Numbers, cls: Class) -> Any:

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
-# Looking for repetitions costs more than it saves below so many particles.
-FEWEST = 512
-# A trial of this many particles says whether the rest is worth looking at.
-_TRIAL = 64
+from jsmitsm.layout import Class
+
+# Looking for repetitions costs more than it saves below so many particles, and where the moment systems of S are as
+# small as this: neighbours times Taylor coefficients.
+FEWEST, SMALLEST = 512, 1000
+# A trial of so many particles says whether the rest is worth looking at, which is done for so many at a time.
+_TRIAL, _AT_A_TIME = 32, 512
 # Offsets are compared in this part of a spacing; what is found equal is then verified to rounding.
 _UNIT = 1e-10
 _ROUNDING = 8 * np.finfo(float).eps
@@ -25,6 +29,10 @@ class Repeats(NamedTuple):
     of: np.ndarray
     neighbours: np.ndarray
 
+    def few(self, cls: Class) -> Class:
+        """The particles that stand for all of a class."""
+        return replace(cls, ids=cls.ids[self.first], neighbours=self.neighbours[self.first])
+
 
 def repeats(points: np.ndarray, ids: np.ndarray, neighbours: np.ndarray, own: np.ndarray) -> Repeats | None:
     """The distinct stencils of the particles ``ids``, or None where hardly any is repeated.
@@ -36,40 +44,63 @@ def repeats(points: np.ndarray, ids: np.ndarray, neighbours: np.ndarray, own: np
     if n < FEWEST:
         return None
     trial = np.linspace(0, n - 1, _TRIAL).astype(int)
-    if len(np.unique(_codes(points, ids[trial], neighbours[trial], own[trial])[1])) > _TRIAL // 2:
+    sizes, shortest = _sizes(points, ids[trial], neighbours[trial])
+    if len(sizes) > _TRIAL // 2:
         return None
-    order, code = _codes(points, ids, neighbours, own)
+    points = np.asfortranarray(points)  # each axis is looked up by itself
+    coded = [_coded(points, ids[some], neighbours[some], own[some], shortest) for some in _parts(n)]
+    neighbours, code = (np.concatenate(x) for x in zip(*coded))
     _, first, of = np.unique(code, return_index=True, return_inverse=True)
     if len(first) > n // 4:
         return None
-    neighbours = np.take_along_axis(neighbours, order, axis=1)
-    away = max(np.abs(x - x[first][of]).max() for x in _offsets(points, ids, neighbours))
-    same = np.array_equal(neighbours >= 0, (neighbours >= 0)[first][of])
-    if away > _ROUNDING * np.abs(points).max() or not same or not np.allclose(own, own[first][of], 1e-14, 1e-14):
-        return None
-    return Repeats(first, of, neighbours)
+    found = Repeats(first, of, neighbours)
+    same = np.allclose(own, own[first][of], 1e-14, 1e-14)
+    return found if same and all(_verified(points, ids, found, some) for some in _parts(n)) else None
 
 
-def _offsets(points: np.ndarray, ids: np.ndarray, neighbours: np.ndarray) -> list[np.ndarray]:
-    """The neighbours' offsets, (n, w) for each axis; 0 where there is none."""
+def _parts(n: int) -> list[slice]:
+    return [slice(k, k + _AT_A_TIME) for k in range(0, n, _AT_A_TIME)]
+
+
+def _sizes(points: np.ndarray, ids: np.ndarray, neighbours: np.ndarray) -> tuple[np.ndarray, float]:
+    """The different sizes of the stencils, in whatever order their neighbours are, and the shortest offset."""
     near = np.where(neighbours >= 0, neighbours, ids[:, None])
-    return [x[near] - x[ids][:, None] for x in np.ascontiguousarray(points.T)]
+    offsets = np.abs(points[near] - points[ids][:, None])
+    sizes, distance = np.sort(offsets.sum(axis=(1, 2))), offsets.max(axis=2)
+    return sizes[np.diff(sizes, prepend=-1.0) > 1e-9 * sizes[-1]], float(distance[distance > 0].min(initial=1.0))
 
 
-def _codes(points: np.ndarray, ids: np.ndarray, neighbours: np.ndarray, own: np.ndarray) -> tuple[np.ndarray, ...]:
-    """An order of each particle's neighbours, and a number for the whole, equal for equal stencils."""
-    offsets = _offsets(points, ids, neighbours)
-    distance = np.maximum.reduce([np.abs(x) for x in offsets])
-    unit = _UNIT * distance[distance > 0].min()
-    factors = np.random.default_rng(0).integers(1 << 62, size=(points.shape[1],))
+def _coded(
+    points: np.ndarray, ids: np.ndarray, near: np.ndarray, own: np.ndarray, unit: float
+) -> tuple[np.ndarray, ...]:
+    """Each particle's neighbours in an order, and a number for the whole, both equal for equal stencils."""
+    rng, there = np.random.default_rng(0), near >= 0
+    code = np.zeros(near.shape, np.int64)
     with np.errstate(over="ignore"):
         # Products wrap around: a hash of the offset.
-        code = np.sum([np.rint(x * (1.0 / unit)).astype(np.int64) * f for x, f in zip(offsets, factors)], axis=0)
-        code = np.where(neighbours >= 0, code, np.iinfo(np.int64).max)
+        for x in _offsets(points, ids, near):
+            code += np.rint(x * (1.0 / (_UNIT * unit))).astype(np.int64) * rng.integers(1 << 62)
+        code[~there] = np.iinfo(np.int64).max
         code[:, 0] = np.iinfo(np.int64).min
         order = np.argsort(code, axis=1)  # equal codes are those of empty places
         mixed = (code ^ (code >> 29)) * np.int64(0x3F58476D1CE4E5B9)
         total = (mixed ^ (mixed >> 32)).sum(axis=1)
         flat = np.rint(own.reshape(len(own), -1) * 1e12).astype(np.int64)
-        total = total + (flat * np.random.default_rng(1).integers(1 << 62, size=flat.shape[1])).sum(axis=1)
-    return order, total
+        total = total + (flat * rng.integers(1 << 62, size=flat.shape[1])).sum(axis=1)
+    return np.take_along_axis(near, order, axis=1), total
+
+
+def _offsets(points: np.ndarray, ids: np.ndarray, neighbours: np.ndarray) -> list[np.ndarray]:
+    """The neighbours' offsets, (n, w) for each axis; 0 where there is none."""
+    near = np.where(neighbours >= 0, neighbours, ids[:, None])
+    return [x[near] - x[ids][:, None] for x in points.T]
+
+
+def _verified(points: np.ndarray, ids: np.ndarray, found: Repeats, some: slice) -> bool:
+    """Whether particles have the stencils of those that stand for them, to rounding."""
+    here, near, of = ids[some], found.neighbours[some], found.of[some]
+    few, stand = ids[found.first], found.neighbours[found.first]
+    if not np.array_equal(near >= 0, (stand >= 0)[of]):
+        return False
+    pairs = zip(_offsets(points, here, near), _offsets(points, few, stand))
+    return max(np.abs(x - y[of]).max() for x, y in pairs) <= _ROUNDING * np.abs(points).max()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +20,7 @@ from jsmitsm.moments import Elimination, Row
 from jsmitsm.neighbours import nearest, within
 from jsmitsm.numbers import Numbers
 from jsmitsm.progress import each, shown
-from jsmitsm.repeats import repeats
+from jsmitsm.repeats import SMALLEST, Repeats, repeats
 from jsmitsm.supports import default_kernel
 from jsmitsm.threads import cores, side_by_side
 from jsmitsm.tracers import is_traced, recorded
@@ -32,9 +32,23 @@ PIECE, MOST_PIECES, _WORK = 16384, 32, 1_200_000
 _STEP, _WORTH = 1.25, 50
 
 
-def operands(disc: Discretization, nums: Numbers, cls: Class, shared: Elimination | None) -> Operands:
+class Around(NamedTuple):
+    """What particles look up of the whole cloud, padded once for all pieces: (M, ...) with periodic images."""
+
+    points: Any
+    kernel: Kernel | None
+    data: Any
+
+
+def around(disc: Discretization, nums: Numbers) -> Around:
+    """What the particles of all classes look up."""
+    given = disc.points, disc.kernel, disc.images.extend_values(nums.data)
+    return Around(*assembly.in_cloud_size(given, len(disc.points)))
+
+
+def operands(disc: Discretization, nums: Numbers, cls: Class, shared: Elimination | None, data: Any) -> Operands:
     """What the particles of a class need; the particle axis first."""
-    ids, scheme, jac, lengths = cls.ids, cls.scheme, nums.jac, None
+    ids, jac, lengths = cls.ids, nums.jac, None
     if jac.shape[-1] > 1:
         jac = _particles_first(jac, np.searchsorted(nums.ids, ids), len(ids))
     elif shared is not None:
@@ -45,10 +59,14 @@ def operands(disc: Discretization, nums: Numbers, cls: Class, shared: Eliminatio
             jac = _particles_first(jac, None, 1)
         else:
             shared, lengths, jac = some
-    own = np.zeros((len(ids), 0, len(scheme.own)))
-    if scheme.n_own:
-        own = _first_columns(nums.own, np.searchsorted(nums.own_ids, ids), scheme.n_own)
-    return Operands(jac, own, disc.images.extend_values(nums.data), shared, lengths)
+    return Operands(jac, _own_conditions(nums, cls), data, shared, lengths)
+
+
+def _own_conditions(nums: Numbers, cls: Class) -> Any:
+    """The conditions of the particles of a class, (n, n_own, S_own)."""
+    if not cls.scheme.n_own:
+        return np.zeros((len(cls.ids), 0, len(cls.scheme.own)))
+    return _first_columns(nums.own, np.searchsorted(nums.own_ids, cls.ids), cls.scheme.n_own)
 
 
 def _eliminations(disc: Discretization, nums: Numbers, cls: Class) -> tuple[Elimination, np.ndarray, np.ndarray] | None:
@@ -87,31 +105,41 @@ def shared_elimination(disc: Discretization, nums: Numbers) -> Elimination | Non
 
 
 def all_rows(disc: Discretization, nums: Numbers) -> tuple[list[Class], list[Row]]:
-    """The rows of every class, and the classes with the neighbours that the rows reach."""
+    """The rows of all particles: of every class in its pieces, with the neighbours that the rows reach."""
     shared = shared_elimination(disc, nums)
     if disc.scheme.method in ("I", "II"):
         return _two_stage_rows(disc, nums, shared)
-    made = [_once_each(disc, nums, cls, shared) for cls in disc.classes]
-    return [cls for cls, _ in made], [row for _, row in made]
+    found = [_repeats(disc, nums, cls) for cls in disc.classes]
+    distinct = [cls if same is None else same.few(cls) for cls, same in zip(disc.classes, found)]
+    cut = pieces(disc, nums, distinct)
+    made = iter(_piece_rows(disc, nums, [piece for some in cut for piece in some], shared))
+    classes, rows = [], []
+    for cls, same, some in zip(disc.classes, found, cut):
+        parts = [next(made) for _ in some]
+        if same is None:
+            classes += some
+            rows += parts
+        else:
+            disc.repeated += len(cls.ids) - len(same.first)
+            classes.append(replace(cls, neighbours=same.neighbours))
+            rows.append(jax.tree.map(partial(_take, at=same.of), _joined(parts)))
+    return classes, rows
 
 
-def _once_each(disc: Discretization, nums: Numbers, cls: Class, shared: Any) -> tuple[Class, Row]:
-    """The rows of a class; repeated stencils of a constant operator are set up once."""
-    own = operands(disc, nums, cls, shared).own
+def _repeats(disc: Discretization, nums: Numbers, cls: Class) -> Repeats | None:
+    """Repeated stencils of a constant operator, which are set up once."""
     one_size = disc.kernel is None or (not is_traced(disc.kernel) and np.ndim(disc.kernel.h) == 0)
+    if cls.scheme.method == "S" and _work(nums, cls) < SMALLEST:
+        return None
+    own = _own_conditions(nums, cls)
     if not one_size or nums.jac.shape[-1] > 1 or cls.scheme.n_data or is_traced(cls.neighbours, disc.points, own):
-        return cls, class_rows(disc, nums, cls, shared)
-    found = repeats(np.asarray(disc.points), cls.ids, cls.neighbours, np.asarray(own))
-    if found is None:
-        return cls, class_rows(disc, nums, cls, shared)
-    disc.repeated += len(cls.ids) - len(found.first)
-    few = Class(cls.ids[found.first], found.neighbours[found.first], cls.scheme)
-    row = class_rows(disc, nums, few, shared)
-    return replace(cls, neighbours=found.neighbours), jax.tree.map(lambda x: x[found.of], row)
+        return None
+    return repeats(np.asarray(disc.points), cls.ids, cls.neighbours, np.asarray(own))
 
 
 def _two_stage_rows(disc: Discretization, nums: Numbers, shared: Any) -> tuple[list[Class], list[Row]]:
     """Methods I and II: recover every particle's coefficients, then insert them into the rows."""
+    there = around(disc, nums)
     wide, far = _recovery_kernel(disc)
     conditioned = np.zeros(len(disc.cloud), int)
     for group in disc.groups:
@@ -120,10 +148,10 @@ def _two_stage_rows(disc: Discretization, nums: Numbers, shared: Any) -> tuple[l
     for count in np.unique(conditioned):
         ids = np.flatnonzero(conditioned == count)
         cls = Class(ids, far[ids], replace(disc.scheme, n_own=int(count)))
-        given = operands(disc, nums, cls, shared)
+        given = operands(disc, nums, cls, shared, there.data)
         parts.append(
             assembly.recoveries(
-                cls.scheme, disc.points, wide, ids, cls.neighbours, given, right_sides(disc, nums, cls)
+                cls.scheme, there.points, wide, ids, cls.neighbours, given, right_sides(disc, nums, cls)
             )
         )
         order.append(ids)
@@ -133,11 +161,11 @@ def _two_stage_rows(disc: Discretization, nums: Numbers, shared: Any) -> tuple[l
     reach = _reach(disc.stencils.indices, far)
     classes, rows = [], []
     for cls in disc.classes:
-        given = operands(disc, nums, cls, shared)
+        given = operands(disc, nums, cls, shared, there.data)
         reached = reach[cls.ids]
         rows.append(
             assembly.closed_rows(
-                cls.scheme, disc.points, disc.kernel, cls.ids, cls.neighbours, given, (reached,), (far, recovered)
+                cls.scheme, there.points, there.kernel, cls.ids, cls.neighbours, given, (reached,), (far, recovered)
             )
         )
         classes.append(replace(cls, neighbours=reached))
@@ -193,26 +221,40 @@ def _recovery_kernel(disc: Discretization) -> tuple[Kernel, Any]:
     return wide, near
 
 
-def pieces(disc: Discretization, nums: Numbers, cls: Class, *more: Any) -> list[Class]:
-    """A large class in pieces of one size (one program serves all), for the cores to share or a bar to move."""
-    n, width, columns = len(cls.ids), cls.neighbours.shape[1], cls.scheme.rec.size * cls.scheme.rec.fields
-    own_elimination = columns**3 // 4 if nums.jac.shape[-1] > 1 else 0
-    worth = min(PIECE, _WORK // (width * columns + own_elimination) + 1)
-    if n < 2 * worth or not (shown() or cores() > 1):
-        return [cls]
-    if recorded() or is_traced(disc.points, disc.kernel, vars(nums), cls.neighbours, more):
-        return [cls]
-    rounds = -(-min(-(-n // PIECE), MOST_PIECES) // cores())  # as many pieces for each core
-    step = max(-(-n // (rounds * cores())), worth)
+def pieces(disc: Discretization, nums: Numbers, classes: list[Class], *more: Any) -> list[list[Class]]:
+    """Every class in pieces of about one size (one program serves all), for the cores to share or a bar to move."""
+    total = sum(len(cls.ids) for cls in classes)
+    worth = min(PIECE, _WORK // max((_work(nums, cls) for cls in classes), default=1) + 1)
+    if total < 2 * worth or not (shown() or cores() > 1):
+        return [[cls] for cls in classes]
+    if recorded() or is_traced(disc.points, disc.kernel, vars(nums), [cls.neighbours for cls in classes], more):
+        return [[cls] for cls in classes]
+    rounds = -(-min(-(-total // PIECE), MOST_PIECES) // cores())  # as many pieces for each core
+    return [_cut(cls, max(-(-total // (rounds * cores())), worth)) for cls in classes]
+
+
+def _work(nums: Numbers, cls: Class) -> int:
+    """How much the system of one particle is to make, in numbers."""
+    columns = cls.scheme.rec.size * cls.scheme.rec.fields
+    return cls.neighbours.shape[1] * columns + (columns**3 // 4 if nums.jac.shape[-1] > 1 else 0)
+
+
+def _cut(cls: Class, size: int) -> list[Class]:
+    """A class in equal pieces of about this size; one that is a piece already stays as it is."""
+    n = len(cls.ids)
+    step = -(-n // max(1, round(n / size)))
     cuts = [slice(start, start + step) for start in range(0, n, step)]
     return [replace(cls, ids=cls.ids[some], neighbours=cls.neighbours[some]) for some in cuts]
 
 
-def _shared_out(what: str, disc: Discretization, cut: list[Class]) -> Any:
-    """Like map, on all cores: for the pieces of a class."""
-    first = cut[0]
-    sizes = assembly.cloud_size(len(disc.points)), assembly.padded_size(len(first.ids)), first.neighbours.shape[1]
-    return partial(side_by_side, program=(what, first.scheme, sizes, disc.kernel is None))
+def _shared_out(what: str, disc: Discretization) -> Any:
+    """Like map, on all cores: for pieces of classes."""
+
+    def program(cls: Class) -> Any:
+        sizes = assembly.cloud_size(len(disc.points)), assembly.padded_size(len(cls.ids)), cls.neighbours.shape[1]
+        return what, cls.scheme, sizes, disc.kernel is None
+
+    return partial(side_by_side, program=program)
 
 
 def _joined(parts: list[Any]) -> Any:
@@ -220,35 +262,31 @@ def _joined(parts: list[Any]) -> Any:
     return parts[0] if len(parts) == 1 else jax.tree.map(lambda *x: np.concatenate(x), *parts)
 
 
-def class_rows(disc: Discretization, nums: Numbers, cls: Class, shared: Any) -> Row:
-    """The rows of one class of particles."""
+def _take(x: Any, at: np.ndarray) -> Any:
+    return x[at]
+
+
+def _piece_rows(disc: Discretization, nums: Numbers, cut: list[Class], shared: Any) -> list[Row]:
+    """The rows of pieces of classes."""
+    there = around(disc, nums)
 
     def one(cls: Class) -> Row:
-        given = operands(disc, nums, cls, shared)
-        return assembly.rows(cls.scheme, disc.points, disc.kernel, cls.ids, cls.neighbours, given)
+        given = operands(disc, nums, cls, shared, there.data)
+        return assembly.rows(cls.scheme, there.points, there.kernel, cls.ids, cls.neighbours, given)
 
-    cut = pieces(disc, nums, cls)
-    return _joined(each("local fits", one, cut, _shared_out("rows", disc, cut)))
+    return each("local fits", one, cut, _shared_out("rows", disc))
+
+
+def class_rows(disc: Discretization, nums: Numbers, cls: Class, shared: Any) -> Row:
+    """The rows of one class of particles."""
+    return _joined(_piece_rows(disc, nums, pieces(disc, nums, [cls])[0], shared))
 
 
 def class_moment_matrices(disc: Discretization, nums: Numbers, cls: Class, shared: Any) -> Any:
     """The moment matrices (n, rows, free) of one class of particles."""
-    given = operands(disc, nums, cls, shared)
-    return assembly.moment_matrices(cls.scheme, disc.points, disc.kernel, cls.ids, cls.neighbours, given)
-
-
-def class_coefficients(disc: Discretization, nums: Numbers, cls: Class, shared: Any, u: Any) -> Any:
-    """Taylor coefficients (n, F, K) of one class of particles from all values u (N, F)."""
-    whole = (disc.images.extend_values(u), disc.images.extend_values(nums.gamma))
-
-    def one(cls: Class) -> Any:
-        given = operands(disc, nums, cls, shared)
-        return assembly.coefficients(
-            cls.scheme, disc.points, disc.kernel, cls.ids, cls.neighbours, given, right_sides(disc, nums, cls), whole
-        )
-
-    cut = pieces(disc, nums, cls, u)
-    return _joined(each("Taylor coefficients", one, cut, _shared_out("coefficients", disc, cut)))
+    there = around(disc, nums)
+    given = operands(disc, nums, cls, shared, there.data)
+    return assembly.moment_matrices(cls.scheme, there.points, there.kernel, cls.ids, cls.neighbours, given)
 
 
 def right_sides(disc: Discretization, nums: Numbers, cls: Class) -> tuple[Any, Any]:
@@ -276,11 +314,22 @@ def _first_columns(values: Any, here: np.ndarray, count: int) -> Any:
 
 
 def all_coefficients(disc: Discretization, nums: Numbers, values: Any) -> Any:
-    """Taylor coefficients (N, F, K) of the particles of all classes; zeros elsewhere."""
-    shared = shared_elimination(disc, nums)
-    parts = [class_coefficients(disc, nums, c, shared, values) for c in disc.classes]
+    """Taylor coefficients (N, F, K) of the particles of all classes, from all values u (N, F); zeros elsewhere."""
+    shared, there = shared_elimination(disc, nums), around(disc, nums)
+    known = disc.images.extend_values(values), disc.images.extend_values(nums.gamma)
+    known = assembly.in_cloud_size(known, len(disc.points))
+
+    def one(cls: Class) -> Any:
+        given = operands(disc, nums, cls, shared, there.data)
+        sides = right_sides(disc, nums, cls)
+        return assembly.coefficients(
+            cls.scheme, there.points, there.kernel, cls.ids, cls.neighbours, given, sides, known
+        )
+
+    cut = [piece for some in pieces(disc, nums, disc.classes, values) for piece in some]
+    parts = each("Taylor coefficients", one, cut, _shared_out("coefficients", disc))
     shape = (len(disc.cloud), disc.rec.fields, disc.rec.size)
-    return _scattered(parts, np.concatenate([c.ids for c in disc.classes]), disc.partner, shape)
+    return _scattered(parts, np.concatenate([c.ids for c in cut]), disc.partner, shape)
 
 
 @partial(in_one_program, static=("shape",))

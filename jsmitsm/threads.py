@@ -6,6 +6,7 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import copy_context
+from functools import lru_cache
 from typing import Any
 
 import jax
@@ -23,24 +24,48 @@ _ready: set[Any] = set()
 _MOST = 1024
 
 
-def side_by_side(function: Callable[[Any], Any], items: Sequence[Any], program: Any) -> Iterator[Any]:
-    """``function`` of every item, in their order, on all cores.
+def side_by_side(function: Callable[[Any], Any], items: Sequence[Any], program: Callable[[Any], Any]) -> Iterator[Any]:
+    """``function`` of every item, in their order, on all cores: this thread works too.
 
-    program: what tells the compiled program behind the function from others; until it has run once, the first item
+    program: of an item, what tells the compiled program behind it from others; until that has run once, an item of it
     runs alone.
     """
-    alone = 0 if program in _ready else 1
-    yield from map(function, items[:alone])
-    if len(_ready) >= _MOST:
-        _ready.clear()
-    _ready.add(program)
-    threads = min(cores(), len(items) - alone)
-    if threads < 2:
-        yield from map(function, items[alone:])
-        return
-    there = _as_here(function)
-    with ThreadPoolExecutor(threads) as pool:
-        yield from pool.map(lambda pair: pair[0].run(there, pair[1]), [(copy_context(), x) for x in items[alone:]])
+    made = {}
+    for k, item in enumerate(items):
+        key = program(item)
+        if key not in _ready:
+            made[k] = function(item)
+            if len(_ready) >= _MOST:
+                _ready.clear()
+            _ready.add(key)
+    left = [k for k in range(len(items)) if k not in made]
+    there, helping = _as_here(function), {}
+    if cores() > 1:
+        helping = {k: _helpers(cores() - 1).submit(copy_context().run, there, items[k]) for k in left[1:]}
+    # This thread begins with the first that is left, and goes on with those that no other has begun.
+    mine = (k for k in left if k not in helping or helping[k].cancel())
+    try:
+        for k in range(len(items)):
+            while k not in made:
+                next_one = next(mine, None)
+                if next_one is not None:
+                    made[next_one] = function(items[next_one])
+                else:
+                    made[k] = helping[k].result()
+            yield made.pop(k)
+    finally:
+        for task in helping.values():
+            task.cancel()
+
+
+@lru_cache(maxsize=1)
+def _helpers(count: int) -> ThreadPoolExecutor:
+    """Threads that stay: starting them takes as long as the rows of several hundred particles."""
+    return ThreadPoolExecutor(count, "jsmitsm")
+
+
+if hasattr(os, "register_at_fork"):  # a fork has none of its parent's threads
+    os.register_at_fork(after_in_child=_helpers.cache_clear)
 
 
 def _as_here(function: Callable[[Any], Any]) -> Callable[[Any], Any]:

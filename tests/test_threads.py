@@ -1,6 +1,7 @@
 """Pieces of a cloud side by side: the same numbers, one compilation, the caller's precision, errors passed on."""
 
 import threading
+import time
 
 import jax
 import numpy as np
@@ -35,17 +36,35 @@ def test_pieces_make_the_whole_and_compile_once(two_cores, monkeypatch):
     np.testing.assert_allclose(shared.coefficients, alone.coefficients, rtol=1e-12, atol=1e-9)
 
 
-def test_work_is_done_in_other_threads(two_cores):
-    names = list(threads.side_by_side(lambda _: threading.current_thread().name, range(6), "names"))
-    assert names[0] == threading.main_thread().name and threading.main_thread().name not in names[1:]
-    again = list(threads.side_by_side(lambda _: threading.current_thread().name, range(6), "names"))
-    assert threading.main_thread().name not in again, "nothing is left to compile"
+def named(_):
+    time.sleep(0.02)
+    return threading.current_thread().name
+
+
+def test_this_thread_and_others_share_the_work(two_cores):
+    here = threading.main_thread().name
+    first = list(threads.side_by_side(named, range(1), lambda _: "names"))
+    assert first == [here], "what must be compiled runs here"
+    shared = list(threads.side_by_side(named, range(6), lambda _: "names"))
+    assert here in shared and len(set(shared)) == 2
+    assert set(threads.side_by_side(named, range(6), lambda k: ("names of", k))) == {here}, "all are compiled here"
+
+
+def test_results_come_in_order_and_calls_inside_of_calls_end(two_cores):
+    def inner(k):
+        return list(
+            threads.side_by_side(lambda j: time.sleep(0.001 * (j % 3)) or 10 * k + j, range(10), lambda _: "in")
+        )
+
+    for _ in range(3):
+        rows = list(threads.side_by_side(inner, range(10), lambda _: "out"))
+    assert np.ravel(rows).tolist() == list(range(100))
 
 
 def test_the_precision_of_the_caller_holds(two_cores):
     narrow = jax.enable_x64 if hasattr(jax, "enable_x64") else jax.experimental.enable_x64
     with narrow(False):
-        kinds = list(threads.side_by_side(lambda _: jax.numpy.ones(3).dtype, range(4), "kinds"))
+        kinds = list(threads.side_by_side(lambda _: jax.numpy.ones(3).dtype, range(4), lambda _: "kinds"))
     assert set(kinds) == {np.dtype(np.float32)}
 
 
@@ -55,5 +74,22 @@ def test_an_error_reaches_the_caller(two_cores):
             raise ValueError("the third")
         return k
 
-    with pytest.raises(ValueError, match="the third"):
-        list(threads.side_by_side(fails, range(6), "errors"))
+    for _ in range(2):  # from this thread, and from another
+        with pytest.raises(ValueError, match="the third"):
+            list(threads.side_by_side(fails, range(6), lambda _: "errors"))
+
+
+def test_after_an_error_nothing_new_is_begun(two_cores):
+    begun = []
+
+    def fails(k):
+        begun.append(k)
+        time.sleep(0.05)
+        if k == 0:
+            raise ValueError("the first")
+
+    list(threads.side_by_side(lambda k: k, range(1), lambda _: "cut short"))
+    with pytest.raises(ValueError, match="the first"):
+        list(threads.side_by_side(fails, range(100), lambda _: "cut short"))
+    time.sleep(0.2)
+    assert len(begun) < 10
