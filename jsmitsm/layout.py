@@ -166,7 +166,8 @@ def sorted_classes(disc: Discretization, ids: np.ndarray, stencils: Stencils) ->
         counts = np.max(np.where(near[ids] >= 0, np.arange(near.shape[1]), 0), axis=1, initial=0) + 1
         narrow = int(np.sort(counts)[4 * (len(ids) - 1) // 5]) if len(ids) else 1
         wide = counts > 1.25 * narrow
-        used = [rounded_width(int(counts[~wide].max(initial=1))), rounded_width(near.shape[1])]
+        widest = int(counts[~wide].max(initial=1)), near.shape[1]
+        used = [_width_at_hand(disc.scheme, rounded_width(width)) for width in widest]
         near = np.pad(near, ((0, 0), (0, max(0, max(used) - near.shape[1]))), constant_values=-1)
     classes = []
     for count in np.unique(disc.n_own[ids]):
@@ -180,6 +181,21 @@ def sorted_classes(disc: Discretization, ids: np.ndarray, stencils: Stencils) ->
 def rounded_width(width: int, step: int = 4) -> int:
     """Widths of stencils come in steps, so that another support seldom needs another program."""
     return width if width <= 5 else -(-width // step) * step
+
+
+# The widths that programs of a scheme were asked for; forgotten ones only compile again.
+_widths: dict[Scheme, set[int]] = {}
+_MOST_SCHEMES = 256
+
+
+def _width_at_hand(scheme: Scheme, width: int) -> int:
+    """This width, or one at most an eighth larger that another cloud had: it finds its program compiled."""
+    if len(_widths) >= _MOST_SCHEMES:
+        _widths.clear()
+    known = _widths.setdefault(scheme, set())
+    width = min((w for w in tuple(known) if width <= w <= 1.125 * width), default=width)
+    known.add(width)
+    return width
 
 
 def table(disc: Discretization) -> Any:
