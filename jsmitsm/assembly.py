@@ -17,11 +17,11 @@ import numpy as np
 
 from jsmitsm import closure, moments, onekernel
 from jsmitsm.closure import Recovery
-from jsmitsm.eager import called, in_one_program
+from jsmitsm.eager import called, in_one_program, only_run
 from jsmitsm.kernels import Kernel
 from jsmitsm.moments import Block, Elimination, Row, Scheme, Support
 from jsmitsm.recursion import row_lifts
-from jsmitsm.tracers import closes_over_traced, recorded
+from jsmitsm.tracers import closes_over_traced, is_traced, recorded
 
 # Particles per block: larger blocks leave the cache and are several times slower; in one of a power of two, rows of
 # the small matrices fall on the same lines of the cache.
@@ -54,7 +54,7 @@ class Operands(NamedTuple):
     one set serves all, or (n,) the numbers of the eliminations to use; own (n, n_own, S_own): the
     particles' own conditions; data (N, n_data, S_data): the conditions neighbours contribute, of every
     particle of the cloud; shared: an elimination that is the same everywhere, with lifts for unit length,
-    or several (B, ...) for the scales ``lengths`` (B,).
+    or several (B, ...) for the scales ``lengths`` (B,); count (): how many of the particles are wanted.
     """
 
     jac: Any
@@ -62,21 +62,22 @@ class Operands(NamedTuple):
     data: Any
     shared: Elimination | None
     lengths: Any = None
+    count: Any = None
 
 
-def padded_size(n: int) -> int:
-    """The size class of n particles: shapes repeat between clouds of similar size, so that a
-    compiled program serves the next cloud too; at most one part in eight is wasted."""
+def padded_size(n: int, steps: int = 8) -> int:
+    """The size class of n particles: shapes repeat between clouds of similar size, so that a compiled program serves
+    the next cloud too. ``steps`` (a power of two) of them to every doubling: at most one part in as many is wasted."""
     if n <= _FEW:
         return _FEW if n > _VERY_FEW else _VERY_FEW
     blocks = -(-n // _BLOCK)
-    step = 1 << max(0, (blocks - 1).bit_length() - 4)
+    step = max(1, (1 << (blocks - 1).bit_length()) // (2 * steps))
     return -(-blocks // step) * step * _BLOCK
 
 
-def _size_at_hand(compiled: set[int], n: int) -> int:
-    """The size class of n particles, or one that is compiled already and at most a quarter too large."""
-    size = min((s for s in tuple(compiled) if n <= s <= 1.25 * n), default=padded_size(n))
+def _size_at_hand(compiled: set[int], n: int, steps: int) -> int:
+    """The size class of n particles, or one that is compiled already and at most two classes too large."""
+    size = min((s for s in tuple(compiled) if n <= s <= (1 + 2 / steps) * n), default=padded_size(n, steps))
     compiled.add(size)
     return size
 
@@ -126,13 +127,16 @@ def _in_size_classes(function: Any) -> Any:
         n, m = points.shape[0], ids.shape[0]
         jac, one_for_all = operands.jac, operands.jac.shape[0] == 1
         big = cloud_size(n)
-        form = scheme, big, neighbours.shape[1], jac.shape[1:], one_for_all, operands.shared is None
-        size = _size_at_hand(compiled.setdefault(form, set()), m)
+        # What is only run stops after m particles; derivatives are taken of all.
+        steps = 8 if recorded() or is_traced(points, kernel, ids, neighbours, operands, each, whole) else 2
+        form = scheme, big, neighbours.shape[1], jac.shape[1:], one_for_all, operands.shared is None, steps
+        size = _size_at_hand(compiled.setdefault(form, set()), m, steps)
         points, kernel, data, whole = in_cloud_size((points, kernel, operands.data, whole), n)
         ids, neighbours, jac, own, each = _widened(
             (ids, neighbours, None if one_for_all else jac, operands.own, each), m, size
         )
-        given = Operands(operands.jac if one_for_all else jac, own, data, operands.shared, operands.lengths)
+        jac, count = operands.jac if one_for_all else jac, np.int32(m)
+        given = Operands(jac, own, data, operands.shared, operands.lengths, count)
         arguments = dict(zip(names, (points, kernel, ids, neighbours, given, each, whole)))
         if recorded() or (kernel is not None and closes_over_traced(kernel.tree_flatten()[1])):
             return _cut(inner(scheme, **arguments), m)
@@ -208,10 +212,26 @@ def _mapped(particle: Any, ids: Any, neighbours: Any, operands: Operands, *more:
     # Arrays without numbers cannot be cut into blocks: None stands for them on the way.
     empty: dict[int, Any] = {}
     each = _without_empty([None if one_for_all else operands.jac, operands.own, *more])
-    made = jax.lax.map(jax.checkpoint(one), (ids, neighbours, *each), batch_size=min(_BLOCK, ids.shape[0]))
+    made = _in_blocks(one, (ids, neighbours, *each), min(_BLOCK, ids.shape[0]), operands.count)
     leaves, shape = jax.tree.flatten(made, is_leaf=lambda x: x is None)
     full = [jnp.zeros((ids.shape[0], *empty[k].shape)) if k in empty else x for k, x in enumerate(leaves)]
     return jax.tree.unflatten(shape, full)
+
+
+def _in_blocks(one: Any, arrays: Any, block: int, count: Any) -> Any:
+    """``one`` of every particle; of the first ``count`` alone where no derivative will be taken."""
+    if not only_run():
+        return jax.lax.map(jax.checkpoint(one), arrays, batch_size=block)
+    n, some = arrays[0].shape[0], jax.jit(jax.vmap(one), inline=True)  # which is traced once for both
+
+    def step(k: Any, out: Any) -> Any:
+        start = k * block
+        made = some(jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, start, block), arrays))
+        return jax.tree.map(lambda x, y: jax.lax.dynamic_update_slice_in_dim(x, y, start, 0), out, made)
+
+    made = jax.eval_shape(some, jax.tree.map(lambda x: x[:block], arrays))
+    out = jax.tree.map(lambda x: jnp.zeros((n, *x.shape[1:]), x.dtype), made)
+    return jax.lax.fori_loop(0, (count + block - 1) // block, step, out)
 
 
 def _without_empty(tree: Any) -> Any:

@@ -14,6 +14,7 @@ Nothing but x is kept between them: what f computes on the way is computed again
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextvars import ContextVar
 from functools import lru_cache, wraps
 from inspect import signature
 from typing import Any
@@ -32,6 +33,26 @@ from jsmitsm.tracers import is_traced, recorded
 Options = tuple[tuple[str, Any], ...] | None
 _LITTLE: Any = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 1}
 _KEPT = 1024
+
+
+_only_run: ContextVar[bool] = ContextVar("a program that is only run", default=False)
+
+
+def only_run() -> bool:
+    """Whether no derivative will be taken of what is traced here: how often a loop runs may be a number of its own."""
+    return _only_run.get()
+
+
+def _to_be_run(function: Callable[..., Any]) -> Callable[..., Any]:
+    @wraps(function)
+    def run(*arguments: Any) -> Any:
+        before = _only_run.set(True)
+        try:
+            return function(*arguments)
+        finally:
+            _only_run.reset(before)
+
+    return run
 
 
 def called(
@@ -91,6 +112,8 @@ class Program:
         if options is None:
             options = tuple(_LITTLE.items()) if jax.default_backend() == "cpu" else ()
         function.__name__ = name
+        if base:
+            function = _to_be_run(function)
         self.part, self.compiled = part, jax.jit(function, compiler_options=dict(options))
         if small:
             self.kernel = jax.jit(onekernel.one_kernel(function), compiler_options=dict(options) | onekernel.OPTIONS)

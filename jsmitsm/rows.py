@@ -23,7 +23,7 @@ from jsmitsm.progress import each, shown
 from jsmitsm.repeats import SMALLEST, Repeats, repeats
 from jsmitsm.supports import default_kernel
 from jsmitsm.threads import cores, side_by_side
-from jsmitsm.tracers import is_traced, recorded
+from jsmitsm.tracers import closes_over_traced, is_traced, recorded
 
 # Particles that the cores share in pieces, between whose ends a progress bar moves. Every piece costs a millisecond, so
 # it has some four of work: _WORK entries of matrices to be made, about.
@@ -223,14 +223,27 @@ def _recovery_kernel(disc: Discretization) -> tuple[Kernel, Any]:
 
 def pieces(disc: Discretization, nums: Numbers, classes: list[Class], *more: Any) -> list[list[Class]]:
     """Every class in pieces of about one size (one program serves all), for the cores to share or a bar to move."""
-    total = sum(len(cls.ids) for cls in classes)
-    worth = min(PIECE, _WORK // max((_work(nums, cls) for cls in classes), default=1) + 1)
-    if total < 2 * worth or not (shown() or cores() > 1):
-        return [[cls] for cls in classes]
-    if recorded() or is_traced(disc.points, disc.kernel, vars(nums), [cls.neighbours for cls in classes], more):
+    total, worth = _total(classes), _worth(nums, classes)
+    if total < 2 * worth or not (shown() or cores() > 1) or _transformed(disc, nums, classes, more):
         return [[cls] for cls in classes]
     rounds = -(-min(-(-total // PIECE), MOST_PIECES) // cores())  # as many pieces for each core
     return [_cut(cls, max(-(-total // (rounds * cores())), worth)) for cls in classes]
+
+
+def _total(classes: list[Class]) -> int:
+    return sum(len(cls.ids) for cls in classes)
+
+
+def _worth(nums: Numbers, classes: list[Class]) -> int:
+    """The least number of particles worth a piece of their own."""
+    return min(PIECE, _WORK // max((_work(nums, cls) for cls in classes), default=1) + 1)
+
+
+def _transformed(disc: Discretization, nums: Numbers, classes: list[Class], *more: Any) -> bool:
+    """Whether JAX traces something here, which holds in this thread alone."""
+    if recorded() or is_traced(disc.points, disc.kernel, vars(nums), [cls.neighbours for cls in classes], more):
+        return True
+    return disc.kernel is not None and closes_over_traced(disc.kernel.tree_flatten()[1])
 
 
 def _work(nums: Numbers, cls: Class) -> int:
@@ -247,14 +260,17 @@ def _cut(cls: Class, size: int) -> list[Class]:
     return [replace(cls, ids=cls.ids[some], neighbours=cls.neighbours[some]) for some in cuts]
 
 
-def _shared_out(what: str, disc: Discretization) -> Any:
-    """Like map, on all cores: for pieces of classes."""
+def _on_all_cores(
+    what: str, one: Any, disc: Discretization, nums: Numbers, classes: list[Class], *more: Any
+) -> list[Any]:
+    """``one`` of all classes, or pieces of them, side by side where nothing is traced."""
 
     def program(cls: Class) -> Any:
         sizes = assembly.cloud_size(len(disc.points)), assembly.padded_size(len(cls.ids)), cls.neighbours.shape[1]
         return what, cls.scheme, sizes, disc.kernel is None
 
-    return partial(side_by_side, program=program)
+    alone = _total(classes) < 2 * _worth(nums, classes) or _transformed(disc, nums, classes, more)
+    return each(what, one, classes, map if alone else partial(side_by_side, program=program))
 
 
 def _joined(parts: list[Any]) -> Any:
@@ -274,7 +290,7 @@ def _piece_rows(disc: Discretization, nums: Numbers, cut: list[Class], shared: A
         given = operands(disc, nums, cls, shared, there.data)
         return assembly.rows(cls.scheme, there.points, there.kernel, cls.ids, cls.neighbours, given)
 
-    return each("local fits", one, cut, _shared_out("rows", disc))
+    return _on_all_cores("local fits", one, disc, nums, cut)
 
 
 def class_rows(disc: Discretization, nums: Numbers, cls: Class, shared: Any) -> Row:
@@ -327,7 +343,7 @@ def all_coefficients(disc: Discretization, nums: Numbers, values: Any) -> Any:
         )
 
     cut = [piece for some in pieces(disc, nums, disc.classes, values) for piece in some]
-    parts = each("Taylor coefficients", one, cut, _shared_out("coefficients", disc))
+    parts = _on_all_cores("Taylor coefficients", one, disc, nums, cut, values)
     shape = (len(disc.cloud), disc.rec.fields, disc.rec.size)
     return _scattered(parts, np.concatenate([c.ids for c in cut]), disc.partner, shape)
 
