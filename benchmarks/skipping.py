@@ -1,7 +1,7 @@
 """What a scene does not need, with and without: ``python -m benchmarks.skipping``.
 
-Each line measures the same problem twice in one run: as the package solves it, and with one thing done that it left
-out. Seconds are medians of repeats after a first call that compiles, on clouds moved by a trifle each time.
+Each line measures the same problem twice in one run, by turns: as the package solves it, and with one thing done that
+it left out. Seconds are medians of repeats after a first call that compiles, on clouds moved by a trifle each time.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from jsmitsm.solve import discretized
 from jsmitsm.taylor import count
 
 DATA = Path(__file__).parent / "data" / "skipping.json"
-REPEATS = 7
+REPEATS = 9
 SIDES = ("left", "right", "bottom", "top")
 SPACING = 0.01
 
@@ -47,6 +47,13 @@ def laplace() -> js.Problem:
     return js.Problem(lambda u, x: js.laplacian(u)(x), dict.fromkeys(SIDES, js.dirichlet(lambda x: jnp.exp(x[0]) * jnp.sin(x[1]))))
 
 
+def conducting() -> js.Problem:
+    """A variable conductivity, and no source."""
+    conductivity = lambda x: 1.5 + jnp.sin(2 * x[0] + x[1])
+    pde = lambda u, x: js.divergence(lambda y: conductivity(y) * js.grad(u)(y))(x)
+    return js.Problem(pde, dict.fromkeys(SIDES, js.dirichlet(lambda x: x[0])))
+
+
 def scattered(k: int, side: int = 100) -> js.Cloud:
     """Ten thousand jittered particles; another trifle for every k."""
     cloud = js.rectangle((0, 0), (1, 1), (side, side), jitter=0.3)
@@ -58,14 +65,15 @@ def lattice(k: int) -> js.Cloud:
     return js.Cloud(np.asarray(cloud.points) * (1.0 + 1e-13 * k), cloud.groups, cloud.normals)
 
 
-def seconds(run: Callable[[int], Any]) -> float:
-    """The median after a first call."""
-    took = []
+def both(without: Callable[[int], Any], with_it: Callable[[int], Any]) -> tuple[float, float]:
+    """The medians of both after their first calls, which compile; by turns, for the machine has slow minutes."""
+    took: tuple[list[float], list[float]] = [], []
     for k in range(REPEATS + 1):
-        start = time.perf_counter()
-        jax.block_until_ready(run(k))
-        took.append(time.perf_counter() - start)
-    return float(np.median(took[1:]))
+        for run, seconds in zip((without, with_it), took):
+            start = time.perf_counter()
+            jax.block_until_ready(run(k))
+            seconds.append(time.perf_counter() - start)
+    return float(np.median(took[0][1:])), float(np.median(took[1][1:]))
 
 
 def local(problem: Callable[[], js.Problem], cloud: Callable[[int], js.Cloud], order: int, **options: Any) -> Callable[[int], Any]:
@@ -73,10 +81,10 @@ def local(problem: Callable[[], js.Problem], cloud: Callable[[int], js.Cloud], o
     ready = {}
 
     def run(k: int) -> Any:
-        return dz.all_rows(*ready[k])[1][0].weights
+        return _weights(*ready[k])
 
     for k in range(REPEATS + 1):
-        disc = discretized(problem(), cloud(k), "S", order, **options)
+        disc = dz.discretize(problem(), cloud(k), "S", order, None, None, None, **options)
         ready[k] = disc, dz.numbers(disc, problem())
     return run
 
@@ -94,38 +102,31 @@ def patched(run: Callable[[int], Any], *patches: Any) -> Callable[[int], Any]:
 def lines() -> Iterator[tuple[str, str, float, float]]:
     """(what is left out, where it was measured, seconds without it, seconds with it)."""
     order = 6
-    bare = local(laplace, scattered, order)
     yield "recursion of a constant operator for every particle", "local phase", *both(
-        bare, patched(_for_each(order), mock.patch.object(rows, "shared_elimination", lambda *a: None)))
+        local(laplace, scattered, order),
+        patched(_for_each(order), mock.patch.object(rows, "shared_elimination", lambda *a: None)))
     yield "kernel derivatives (S needs none)", "local phase, III against S in one kernel", *both(
         _rows_of("S"), _rows_of("III"))
-    yield "weights of a source that is zero", "local phase", *both(
-        patched(bare, mock.patch.object(assembly, "rows", _unsourced(assembly.rows))), bare)
-    yield "moment systems of repeated stencils", "local phase on a lattice", *both(
-        local(poisson, lattice, order), patched(local(poisson, lattice, order), mock.patch.object(repeats, "FEWEST", 10**9)))
-    disc = discretized(poisson(), scattered(0), "S", order)
-    held = np.flatnonzero(disc.held.all(axis=1))
-    inside = seconds(bare)
-    yield "rows of Dirichlet particles", f"local phase, {len(held)} of {len(disc.held)} particles", inside, inside * (
-        len(disc.held) / (len(disc.held) - len(held)))
+    yield "weights of a source that is zero", "local phase, variable coefficients", *both(
+        local(conducting, scattered, order, sources=False), local(conducting, scattered, order))
+    yield "moment systems of repeated stencils", "local phase on a lattice, order 8", *both(
+        local(poisson, lattice, 8), patched(local(poisson, lattice, 8), mock.patch.object(repeats, "FEWEST", 10**9)))
+    yield "rows of Dirichlet particles", *_held_rows()
 
     def solve(k: int) -> Any:
         linsolve.clear_cache()
         return js.solve(poisson(), scattered(k), order=order)
 
-    whole = seconds(lambda k: solve(k).u)
-    yield "Taylor coefficients of all particles", "solve", whole, seconds(lambda k: solve(k).coefficients)
-    yield "error estimate", "solve", whole, seconds(lambda k: solve(k).error_estimate())
-    yield "bookkeeping for gradients with respect to h", "solve at a given kernel and stencils", *_gradient()
+    yield "Taylor coefficients of all particles", "solve", *both(
+        lambda k: solve(k).u, lambda k: solve(k).coefficients)
+    yield "error estimate", "solve", *both(lambda k: solve(k).u, lambda k: solve(k).error_estimate())
+    yield "what a gradient with respect to h needs", "solve at a given kernel and stencils", *_gradient()
     ready = js.factorize(poisson(), scattered(0), order=order)
-    yield "neighbours, rows and factors, when only data changed", "js.factorize against solve", seconds(
-        lambda k: ready.solve(poisson(1.0 + k)).u), whole
+    yield "neighbours, rows and factors, when only data changed", "js.factorize against solve", *both(
+        lambda k: ready.solve(poisson(1.0 + k)).u, lambda k: solve(k).u)
     yield "the factorisation, when only a value on the boundary changed", "solve of the same cloud again", *_kept_factor()
+    yield "neighbours and the order of elimination, when only the kernel changed", "solve at a given kernel", *_kernel()
     yield "compiling for another cloud of similar size", "solve, 9,801 particles after 10,000", *_compiled_again()
-
-
-def both(without: Callable[[int], Any], with_it: Callable[[int], Any]) -> tuple[float, float]:
-    return seconds(without), seconds(with_it)
 
 
 def _for_each(order: int) -> Callable[[int], Any]:
@@ -134,11 +135,23 @@ def _for_each(order: int) -> Callable[[int], Any]:
     nums = dz.numbers(disc, laplace())
     nums.jac = np.broadcast_to(nums.jac, (*nums.jac.shape[:2], 1, len(nums.ids)))
     nums.jac = np.concatenate([nums.jac, np.zeros((*nums.jac.shape[:2], count(2, disc.rec.degree) - 1, len(nums.ids)))], 2)
-    return lambda k: dz.all_rows(disc, nums)[1][0].weights
+    return lambda k: _weights(disc, nums)
 
 
-def _unsourced(function: Callable) -> Callable:
-    return lambda scheme, *rest: function(replace(scheme, sourced=False), *rest)
+def _held_rows() -> tuple[str, float, float]:
+    """In a box, a quarter of whose particles are on its sides."""
+    cloud = js.box((0, 0, 0), (1, 1, 1), (24, 24, 24), jitter=0.3)
+    posed = js.Problem(lambda u, x: js.laplacian(u)(x) - 1.0, dict.fromkeys(
+        (*SIDES, "front", "back"), js.dirichlet(0.0)))  # fmt: skip
+    disc, every = (discretized(posed, cloud, "S", 4) for _ in range(2))
+    every.classes = dz.sorted_classes(every, np.arange(len(cloud)), every.stencils)
+    nums = dz.numbers(disc, posed)
+    where = f"local phase, {len(cloud) - len(disc.active)} of {len(cloud)} particles"
+    return where, *both(lambda k: _weights(disc, nums), lambda k: _weights(every, nums))
+
+
+def _weights(disc: Any, nums: Any) -> Any:
+    return [row.weights for row in dz.all_rows(disc, nums)[1]]
 
 
 def _rows_of(method: str) -> Callable[[int], Any]:
@@ -146,20 +159,34 @@ def _rows_of(method: str) -> Callable[[int], Any]:
     kernel = js.Gaussian(h=2.0 * SPACING, d=2.0)
     disc = discretized(laplace(), cloud, method, 4, kernel)
     nums = dz.numbers(disc, laplace())
-    return lambda k: dz.all_rows(disc, nums)[1][0].weights
+    return lambda k: _weights(disc, nums)
 
 
-def _gradient() -> tuple[float, float]:
-    cloud = scattered(0)
-    kernel = js.Gaussian(h=2.0 * SPACING, d=2.0)
+def _kernel_problem() -> tuple[Callable[[Any], Any], float]:
+    """The mean square of the solution as a function of the smoothing length, and a length."""
+    cloud, problem = scattered(0), poisson()
     near = js.stencils(cloud, radius=4.4 * SPACING)
-    problem = poisson()
 
     def mean(h: Any) -> Any:
         return jnp.mean(js.solve(problem, cloud, kernel=js.Gaussian(h=h, d=2.0), stencils=near, order=4).u ** 2)
 
-    h = float(kernel.h)
-    return seconds(lambda k: mean(h * (1 + 1e-9 * k))), seconds(lambda k: jax.value_and_grad(mean)(h * (1 + 1e-9 * k)))
+    return mean, 2.0 * SPACING
+
+
+def _gradient() -> tuple[float, float]:
+    mean, h = _kernel_problem()
+    # No length comes twice: a factor would be at hand.
+    return both(lambda k: mean(h * (1 + 1e-9 * k)), lambda k: jax.value_and_grad(mean)(h * (1 - 1e-9 * (k + 1))))
+
+
+def _kernel() -> tuple[float, float]:
+    mean, h = _kernel_problem()
+
+    def anew(k: int) -> Any:
+        linsolve.clear_cache()
+        return js.solve(poisson(), scattered(0), kernel=js.Gaussian(h=h * (1 - 1e-9 * (k + 1)), d=2.0), order=4).u
+
+    return both(lambda k: mean(h * (1 + 1e-9 * k)), anew)
 
 
 def _kept_factor() -> tuple[float, float]:
@@ -170,7 +197,7 @@ def _kept_factor() -> tuple[float, float]:
             linsolve.clear_cache()
         return js.solve(poisson(1.0 + k), cloud, order=6).u
 
-    return seconds(lambda k: solved(k, False)), seconds(lambda k: solved(k, True))
+    return both(lambda k: solved(k, False), lambda k: solved(k, True))
 
 
 def _compiled_again() -> tuple[float, float]:
@@ -193,7 +220,7 @@ def main() -> None:
         found.append([what, where, f"{1e3 * without:.3g}", f"{1e3 * with_it:.3g}", f"{with_it / without:.2g}"])
         print(" | ".join(found[-1]), flush=True)
     note = (
-        f"Milliseconds, medians of {REPEATS}, ten thousand particles, on {about['cores']} cores of {about['processor']} "
+        f"Milliseconds, medians of {REPEATS}, ten thousand particles (more in the box), on {about['cores']} cores of {about['processor']} "
         "(`python -m benchmarks.skipping`)."
     )
     made = {"columns": ["what is left out", "measured in", "without", "with", "ratio"], "rows": found, "note": note}

@@ -136,6 +136,7 @@ class Factorization:
         self._parts: list[Any] = []  # of the least-squares form
         data, rows, cols, self._right = self._run.assembled(self._nums, self._parts)
         self._matrix = data, rows, cols
+        self._factor: Any = None  # kept as long as this is, whatever else is solved
 
     @bar("solve")
     def solve(self, problem: Problem) -> Solution:
@@ -170,6 +171,8 @@ class Factorization:
         run = copy(self._run)  # the solution's own: what it says of itself must not change with the next
         run.problem, run.messages, run.against = problem, list(run.messages), list(run.against)
         x, good = run.solved(*self._matrix, right)
+        if self._factor is None and not is_traced(self._matrix):
+            self._factor = run.factor_of(*self._matrix)
         values = dz.with_held(disc, nums, x)
         traced = is_traced(values)
         if not traced:

@@ -1,7 +1,8 @@
 """Factorisations kept for the next solve with the same matrix.
 
 They are found again by the values of the matrix, compared exactly, so that the adjoint of a solve,
-its tangent and a second right-hand side need not know of one another.
+its tangent and a second right-hand side need not know of one another. The last ones are kept here; one that is kept
+elsewhere, as by js.factorize, is found as well.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -67,24 +69,24 @@ class _Pattern:
 
 
 @dataclass(eq=False)
-class _Entry:
-    """A kept factorisation and the matrix it was made of."""
+class _Matrix:
+    """What a factorisation was made of."""
 
     data: np.ndarray
     glance: Any  # at the data
     pattern: _Pattern
-    factor: Factor
 
 
-_cache: list[_Entry] = []  # the last one used stands last
+_kept: list[Factor] = []  # the last one used stands last
+_known: WeakKeyDictionary[Factor, _Matrix] = WeakKeyDictionary()  # those that somebody else keeps, too
 _lock = threading.Lock()
 CACHE_ENTRIES, CACHE_BYTES = 64, 2**30
 
 
 def clear_cache() -> None:
-    """Forget every kept factorisation and so free its memory."""
+    """Forget every factorisation that nobody else keeps, and so free its memory."""
     with _lock:
-        _cache.clear()
+        _kept.clear()
 
 
 def factorisations() -> int:
@@ -100,23 +102,32 @@ def lookup(arrays: Sequence[Any], settings: Settings) -> tuple[Factor, bool]:
     pattern, order = None, None
     compared: dict[int, bool] = {}  # patterns by identity: comparing one takes milliseconds
     with _lock:
-        for entry in reversed(_cache):
-            other = entry.pattern
+        kept = _kept[::-1]
+        for factor in [*kept, *(other for other in list(_known) if other not in kept)]:
+            matrix = _known[factor]
+            other = matrix.pattern
             if id(other) not in compared:
                 compared[id(other)] = other.fits(rows, cols, settings, glance)
             if compared[id(other)]:
-                if first == entry.glance and _same(data, entry.data):
-                    _cache.remove(entry)
-                    _cache.append(entry)
-                    return entry.factor, True
-                pattern, order = other, entry.factor.order
+                if first == matrix.glance and _same(data, matrix.data):
+                    _keep(factor)
+                    return factor, True
+                pattern, order = other, factor.order
     s = settings
     made = Factor(data, rows, cols, s.n, s.points, s.solver, s.elliptic, s.refine, order)
     with _lock:
         # Copies: the caller may change an array in place, even under a JAX array that shares it.
         pattern = pattern or _Pattern(rows.copy(), cols.copy(), settings, glance)
-        _cache.append(_Entry(data.copy(), first, pattern, made))
-        total = sum(entry.factor.nbytes for entry in _cache)
-        while len(_cache) > 1 and (len(_cache) > CACHE_ENTRIES or total > CACHE_BYTES):
-            total -= _cache.pop(0).factor.nbytes
+        _known[made] = _Matrix(data.copy(), first, pattern)
+        _keep(made)
     return made, False
+
+
+def _keep(factor: Factor) -> None:
+    """Put a factorisation last, and forget the first ones where they are too many or too large."""
+    if factor in _kept:
+        _kept.remove(factor)
+    _kept.append(factor)
+    total = sum(other.nbytes for other in _kept)
+    while len(_kept) > 1 and (len(_kept) > CACHE_ENTRIES or total > CACHE_BYTES):
+        total -= _kept.pop(0).nbytes

@@ -100,9 +100,10 @@ def check_supports(
     near, points = np.asarray(near), np.asarray(points)
     inside = near >= 0
     if kernel is not None:
-        offset = points[np.maximum(near, 0)] - points[: len(near), None]
-        reach = np.broadcast_to(np.asarray(kernel.h) * np.asarray(kernel.d), (len(near),))
-        inside &= np.linalg.norm(offset, axis=2) <= reach[:, None] * EDGE
+        reach = np.broadcast_to(np.asarray(kernel.h) * np.asarray(kernel.d), (len(near),)) * EDGE
+        index = np.maximum(near, 0)
+        squared = sum((x[index] - x[: len(near), None]) ** 2 for x in np.ascontiguousarray(points.T))
+        inside &= squared <= reach[:, None] ** 2
     counts = inside.sum(axis=1) - (scheme.method != "SSPH")
     # I and II widen the supports of their first stage themselves.
     needed = np.full(len(near), 2 if scheme.method in ("I", "II") else scheme_size(scheme))

@@ -261,12 +261,15 @@ class Run:
         if self.nums is None:
             return None
         if self.formulation == "lsq":
-            data, r, c, b = dz.least_squares(self.disc, self.nums)
+            data, r, c, _ = dz.least_squares(self.disc, self.nums)
         else:
             assert self.rows is not None
             data, r, c = dz.matrix(self.disc, *self.rows)
-            b = np.zeros(int((~self.disc.held).sum()))
-        data, r, c, b, points = self._bordered(data, r, c, b)
+        return self.factor_of(data, r, c)
+
+    def factor_of(self, data: Any, r: Any, c: Any) -> linsolve.Factor:
+        """The factors of a global system."""
+        data, r, c, b, points = self._bordered(data, r, c, np.zeros(int((~self.disc.held).sum())))
         return linsolve.factor(data, r, c, len(b), points, self.solver, self._elliptic)
 
     @cached_property

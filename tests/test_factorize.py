@@ -1,5 +1,6 @@
 """A kept factorisation gives what a solve of its own gives, in the same form, and makes nothing again that it has."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -42,6 +43,17 @@ def test_it_follows_the_form_that_solve_chooses(problem, form):
         np.testing.assert_allclose(sol.u, own.u, rtol=0, atol=1e-10 * np.abs(own.u).max())
         np.testing.assert_allclose(sol.error_estimate(), own.error_estimate(), rtol=1e-4, atol=1e-9)
         assert sol.flags == own.flags
+
+
+def test_its_factors_stay_whatever_else_is_solved():
+    ready = js.factorize(poisson(1.0), CLOUD, solver="sparse")
+    ready.solve(poisson(1.0))
+    linsolve.clear_cache()
+    made = linsolve.factorisations()
+    assert ready.solve(poisson(2.0)).stats["linear"]["cached"]
+    grad = jax.grad(lambda s: jnp.sum(ready.solve(poisson(s)).u))(2.0)
+    assert linsolve.factorisations() == made
+    assert np.isclose(grad, np.sum(ready.solve(poisson(1.0)).u - ready.solve(poisson(0.0)).u))
 
 
 def test_the_form_may_be_given():

@@ -291,10 +291,10 @@ def test_cache_is_bounded(monkeypatch):
     index = np.arange(3)
     for k in range(1, 5):
         factor(np.full(3, float(k)), index, index, 3)
-    assert len(factorcache._cache) == 2
+    assert len(factorcache._kept) == 2
     monkeypatch.setattr(factorcache, "CACHE_BYTES", 1)
     f = factor(np.full(3, 9.0), index, index, 3)
-    assert [entry.factor for entry in factorcache._cache] == [f]
+    assert factorcache._kept == [f]
 
 
 # ------------------------------------------------------------------------------------------ order
@@ -577,7 +577,7 @@ def test_matrices_that_differ_in_their_entries_alone_share_the_places():
     rows, cols, b = np.arange(5), np.arange(5), np.ones(5)
     several = [solve(np.full(5, scale), rows.copy(), cols.copy(), b, n=5, solver="sparse") for scale in (1.0, 2.0, 4.0)]
     solve(np.full(6, 1.0), np.arange(6), np.arange(6), np.ones(6), n=6, solver="sparse")
-    assert len({id(entry.pattern) for entry in factorcache._cache}) == 2
+    assert len({id(factorcache._known[f].pattern) for f in factorcache._kept}) == 2
     before = factorisations()
     for scale, x in zip((1.0, 2.0, 4.0), several):
         assert np.array_equal(solve(np.full(5, scale), rows, cols, b, n=5, solver="sparse"), x)
