@@ -190,7 +190,7 @@ def _kernel() -> tuple[float, float]:
 
 
 def _kept_factor() -> tuple[float, float]:
-    cloud = scattered(0)
+    cloud = scattered(99)  # no other line's
 
     def solved(k: int, forget: bool) -> Any:
         if forget:

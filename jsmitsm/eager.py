@@ -125,6 +125,9 @@ class Program:
             return self._run(*arguments)
 
     def _run(self, *arguments: Any) -> Any:
+        config: Any = jax.config
+        if config.jax_disable_jit:  # step by step: what a compiled program makes of numpy's arrays by itself
+            return self.function(*map(jnp.asarray, arguments))
         if not self.small:
             return self.compiled(*arguments)
         try:

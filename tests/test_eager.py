@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import jsmitsm as js
 from jsmitsm import eager
 from jsmitsm.eager import called, in_one_program
 
@@ -104,3 +105,12 @@ def test_settings_of_the_moment_are_kept_apart():
 
 def _ones(x):
     return {"y": x + jnp.arange(2, dtype=float)}
+
+
+def test_without_jit_a_solve_goes_step_by_step():
+    """As one debugs it: jax.disable_jit()."""
+    problem = js.Problem(lambda u, x: js.laplacian(u)(x) - x[0], {"left": js.dirichlet(0.0), "right": js.neumann(1.0)})
+    cloud = js.interval(0.0, 1.0, 9)
+    compiled = js.solve(problem, cloud, order=2).u
+    with jax.disable_jit():
+        np.testing.assert_allclose(js.solve(problem, cloud, order=2).u, compiled, rtol=1e-12)
