@@ -26,6 +26,8 @@ from jsmitsm.tracers import closes_over_traced, is_traced, recorded
 # Particles per block: larger blocks leave the cache and are several times slower; in one of a power of two, rows of
 # the small matrices fall on the same lines of the cache.
 _BLOCK = 40
+# A GPU is filled by many at once; these take some hundred megabytes.
+_WIDE = 8192
 # So few particles are always padded to as many.
 _FEW, _VERY_FEW = 2 * _BLOCK, 16
 # Options of XLA on CPUs. Its matrix products here are too small to share among threads; threads.py does that with whole
@@ -212,17 +214,19 @@ def _mapped(particle: Any, ids: Any, neighbours: Any, operands: Operands, *more:
     # Arrays without numbers cannot be cut into blocks: None stands for them on the way.
     empty: dict[int, Any] = {}
     each = _without_empty([None if one_for_all else operands.jac, operands.own, *more])
-    made = _in_blocks(one, (ids, neighbours, *each), min(_BLOCK, ids.shape[0]), operands.count)
+    made = _in_blocks(one, (ids, neighbours, *each), operands.count)
     leaves, shape = jax.tree.flatten(made, is_leaf=lambda x: x is None)
     full = [jnp.zeros((ids.shape[0], *empty[k].shape)) if k in empty else x for k, x in enumerate(leaves)]
     return jax.tree.unflatten(shape, full)
 
 
-def _in_blocks(one: Any, arrays: Any, block: int, count: Any) -> Any:
+def _in_blocks(one: Any, arrays: Any, count: Any) -> Any:
     """``one`` of every particle; of the first ``count`` alone where no derivative will be taken."""
-    if not only_run():
+    n, on_cpu = arrays[0].shape[0], jax.default_backend() == "cpu"
+    block = min(n, _BLOCK if on_cpu else _WIDE)
+    if not (only_run() and on_cpu):
         return jax.lax.map(jax.checkpoint(one), arrays, batch_size=block)
-    n, some = arrays[0].shape[0], jax.jit(jax.vmap(one), inline=True)  # which is traced once for both
+    some = jax.jit(jax.vmap(one), inline=True)  # traced once for both
 
     def step(k: Any, out: Any) -> Any:
         start = k * block

@@ -224,7 +224,8 @@ def _recovery_kernel(disc: Discretization) -> tuple[Kernel, Any]:
 def pieces(disc: Discretization, nums: Numbers, classes: list[Class], *more: Any) -> list[list[Class]]:
     """Every class in pieces of about one size (one program serves all), for the cores to share or a bar to move."""
     total, worth = _total(classes), _worth(nums, classes)
-    if total < 2 * worth or not (shown() or cores() > 1) or _transformed(disc, nums, classes, more):
+    shared = shown() or (cores() > 1 and jax.default_backend() == "cpu")
+    if total < 2 * worth or not shared or _transformed(disc, nums, classes, more):
         return [[cls] for cls in classes]
     rounds = -(-min(-(-total // PIECE), MOST_PIECES) // cores())  # as many pieces for each core
     return [_cut(cls, max(-(-total // (rounds * cores())), worth)) for cls in classes]
