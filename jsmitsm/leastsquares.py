@@ -16,7 +16,7 @@ from jsmitsm.moments import Block
 from jsmitsm.neighbours import Stencils
 from jsmitsm.numbers import Numbers
 from jsmitsm.progress import each
-from jsmitsm.rows import around, operands, pieces, right_sides, shared_elimination
+from jsmitsm.rows import around, in_pieces, operands, right_sides, shared_elimination
 from jsmitsm.tracers import is_traced
 
 
@@ -67,7 +67,7 @@ def _unknown_count(disc: Discretization) -> int:
 def _fitted(disc: Discretization, nums: Numbers) -> list[Class]:
     """All particles, those with held values too, in pieces."""
     whole = sorted_classes(disc, nums.ids, Stencils(table(disc), None))
-    return [piece for some in pieces(disc, nums, whole) for piece in some]
+    return in_pieces(disc, nums, whole)
 
 
 def _class_blocks(disc: Discretization, nums: Numbers, cls: Class, shared: Any) -> Block:

@@ -9,8 +9,8 @@ import numpy as np
 
 from jsmitsm.layout import Class
 
-# Looking for repetitions costs more than it saves below so many particles, and where the moment systems of S are as
-# small as this: neighbours times Taylor coefficients.
+# Looking for repetitions costs more than it saves below so many particles, and where the moment systems are as small
+# as this: neighbours times Taylor coefficients.
 FEWEST, SMALLEST = 512, 1000
 # A trial of so many particles says whether the rest is worth looking at, which is done for so many at a time.
 _TRIAL, _AT_A_TIME = 32, 512

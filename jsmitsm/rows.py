@@ -13,6 +13,7 @@ import numpy as np
 
 from jsmitsm import assembly, moments
 from jsmitsm.assembly import Operands
+from jsmitsm.closure import Recovery
 from jsmitsm.eager import in_one_program
 from jsmitsm.kernels import Kernel
 from jsmitsm.layout import Class, Discretization
@@ -28,6 +29,8 @@ from jsmitsm.tracers import closes_over_traced, is_traced, recorded
 # Particles that the cores share in pieces, between whose ends a progress bar moves. Every piece costs a millisecond, so
 # it has some four of work: _WORK entries of matrices to be made, about.
 PIECE, MOST_PIECES, _WORK = 16384, 32, 1_200_000
+# What the systems of other methods take, measured by those of S.
+_TIMES = {"I": 8, "II": 8, "III": 4}
 # Lengths that share an elimination differ by less than this ratio; particles that each elimination must serve.
 _STEP, _WORTH = 1.25, 50
 
@@ -129,7 +132,7 @@ def all_rows(disc: Discretization, nums: Numbers) -> tuple[list[Class], list[Row
 def _repeats(disc: Discretization, nums: Numbers, cls: Class) -> Repeats | None:
     """Repeated stencils of a constant operator, which are set up once."""
     one_size = disc.kernel is None or (not is_traced(disc.kernel) and np.ndim(disc.kernel.h) == 0)
-    if cls.scheme.method == "S" and _work(nums, cls) < SMALLEST:
+    if _work(nums, cls) < SMALLEST:
         return None
     own = _own_conditions(nums, cls)
     if not one_size or nums.jac.shape[-1] > 1 or cls.scheme.n_data or is_traced(cls.neighbours, disc.points, own):
@@ -144,32 +147,32 @@ def _two_stage_rows(disc: Discretization, nums: Numbers, shared: Any) -> tuple[l
     conditioned = np.zeros(len(disc.cloud), int)
     for group in disc.groups:
         conditioned[group.ids] = 0 if group.held else group.n_rows
-    parts, order = [], []
+    whole = []
     for count in np.unique(conditioned):
         ids = np.flatnonzero(conditioned == count)
-        cls = Class(ids, far[ids], replace(disc.scheme, n_own=int(count)))
-        given = operands(disc, nums, cls, shared, there.data)
-        parts.append(
-            assembly.recoveries(
-                cls.scheme, there.points, wide, ids, cls.neighbours, given, right_sides(disc, nums, cls)
-            )
-        )
-        order.append(ids)
+        whole.append(Class(ids, far[ids], replace(disc.scheme, n_own=int(count))))
+
+    def recoveries(cls: Class) -> Recovery:
+        given, sides = operands(disc, nums, cls, shared, there.data), right_sides(disc, nums, cls)
+        return assembly.recoveries(cls.scheme, there.points, wide, cls.ids, cls.neighbours, given, sides)
+
+    cut = in_pieces(disc, nums, whole)
+    parts = _on_all_cores("recoveries", recoveries, disc, nums, cut)
     xp = jnp if is_traced(parts) else np
-    back = np.argsort(np.concatenate(order))
+    back = np.argsort(np.concatenate([cls.ids for cls in cut]))
     recovered = jax.tree.map(lambda *x: xp.concatenate(x)[back], *parts)
     reach = _reach(disc.stencils.indices, far)
-    classes, rows = [], []
-    for cls in disc.classes:
-        given = operands(disc, nums, cls, shared, there.data)
-        reached = reach[cls.ids]
-        rows.append(
-            assembly.closed_rows(
-                cls.scheme, there.points, there.kernel, cls.ids, cls.neighbours, given, (reached,), (far, recovered)
-            )
+    known = assembly.in_cloud_size((far, recovered), len(far))
+
+    def rows(cls: Class) -> Row:
+        given, reached = operands(disc, nums, cls, shared, there.data), (reach[cls.ids],)
+        return assembly.closed_rows(
+            cls.scheme, there.points, there.kernel, cls.ids, cls.neighbours, given, reached, known
         )
-        classes.append(replace(cls, neighbours=reached))
-    return classes, rows
+
+    cut = in_pieces(disc, nums, disc.classes)
+    made = _on_all_cores("local fits", rows, disc, nums, cut)
+    return [replace(cls, neighbours=reach[cls.ids]) for cls in cut], made
 
 
 def _reach(near: Any, far: Any) -> np.ndarray:
@@ -231,6 +234,11 @@ def pieces(disc: Discretization, nums: Numbers, classes: list[Class], *more: Any
     return [_cut(cls, max(-(-total // (rounds * cores())), worth)) for cls in classes]
 
 
+def in_pieces(disc: Discretization, nums: Numbers, classes: list[Class], *more: Any) -> list[Class]:
+    """The pieces of all classes."""
+    return [piece for some in pieces(disc, nums, classes, *more) for piece in some]
+
+
 def _total(classes: list[Class]) -> int:
     return sum(len(cls.ids) for cls in classes)
 
@@ -250,7 +258,8 @@ def _transformed(disc: Discretization, nums: Numbers, classes: list[Class], *mor
 def _work(nums: Numbers, cls: Class) -> int:
     """How much the system of one particle is to make, in numbers."""
     columns = cls.scheme.rec.size * cls.scheme.rec.fields
-    return cls.neighbours.shape[1] * columns + (columns**3 // 4 if nums.jac.shape[-1] > 1 else 0)
+    matrix = cls.neighbours.shape[1] * columns * _TIMES.get(cls.scheme.method, 1)
+    return matrix + (columns**3 // 4 if nums.jac.shape[-1] > 1 else 0)
 
 
 def _cut(cls: Class, size: int) -> list[Class]:
@@ -296,7 +305,7 @@ def _piece_rows(disc: Discretization, nums: Numbers, cut: list[Class], shared: A
 
 def class_rows(disc: Discretization, nums: Numbers, cls: Class, shared: Any) -> Row:
     """The rows of one class of particles."""
-    return _joined(_piece_rows(disc, nums, pieces(disc, nums, [cls])[0], shared))
+    return _joined(_piece_rows(disc, nums, in_pieces(disc, nums, [cls]), shared))
 
 
 def class_moment_matrices(disc: Discretization, nums: Numbers, cls: Class, shared: Any) -> Any:
@@ -343,7 +352,7 @@ def all_coefficients(disc: Discretization, nums: Numbers, values: Any) -> Any:
             cls.scheme, there.points, there.kernel, cls.ids, cls.neighbours, given, sides, known
         )
 
-    cut = [piece for some in pieces(disc, nums, disc.classes, values) for piece in some]
+    cut = in_pieces(disc, nums, disc.classes, values)
     parts = _on_all_cores("Taylor coefficients", one, disc, nums, cut, values)
     shape = (len(disc.cloud), disc.rec.fields, disc.rec.size)
     return _scattered(parts, np.concatenate([c.ids for c in cut]), disc.partner, shape)
