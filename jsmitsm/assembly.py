@@ -29,7 +29,7 @@ _BLOCK = 40
 # A GPU is filled by many at once; these take some hundred megabytes.
 _WIDE = 8192
 # So few particles are always padded to as many.
-_FEW, _VERY_FEW = 2 * _BLOCK, 16
+_FEW, _VERY_FEW, _LEAST = 2 * _BLOCK, 16, 64
 # Options of XLA on CPUs. Its matrix products here are too small to share among threads; threads.py does that with whole
 # pieces. Up to so many particles a program is compiled with less effort, in a half or a sixth of the time; what that
 # costs in running is about a millisecond a call.
@@ -86,7 +86,7 @@ def _size_at_hand(compiled: set[int], n: int, steps: int) -> int:
 
 def cloud_size(n: int) -> int:
     """The size class of a cloud of n particles, which are only looked up: few programs serve all clouds."""
-    return max(_FEW, 1 << (n - 1).bit_length())
+    return max(_LEAST, 1 << (n - 1).bit_length())
 
 
 def in_cloud_size(tree: Any, n: int) -> Any:

@@ -125,7 +125,7 @@ def all_rows(disc: Discretization, nums: Numbers) -> tuple[list[Class], list[Row
         else:
             disc.repeated += len(cls.ids) - len(same.first)
             classes.append(replace(cls, neighbours=same.neighbours))
-            rows.append(jax.tree.map(partial(_take, at=same.of), _joined(parts)))
+            rows.append(jax.tree.map(lambda x, of=same.of: x[of], _joined(parts)))
     return classes, rows
 
 
@@ -276,7 +276,7 @@ def _on_all_cores(
     """``one`` of all classes, or pieces of them, side by side where nothing is traced."""
 
     def program(cls: Class) -> Any:
-        sizes = assembly.cloud_size(len(disc.points)), assembly.padded_size(len(cls.ids)), cls.neighbours.shape[1]
+        sizes = assembly.cloud_size(len(disc.points)), assembly.padded_size(len(cls.ids), 2), cls.neighbours.shape[1]
         return what, cls.scheme, sizes, disc.kernel is None
 
     alone = _total(classes) < 2 * _worth(nums, classes) or _transformed(disc, nums, classes, more)
@@ -286,10 +286,6 @@ def _on_all_cores(
 def _joined(parts: list[Any]) -> Any:
     """Pytrees with the particle axis first, one after another."""
     return parts[0] if len(parts) == 1 else jax.tree.map(lambda *x: np.concatenate(x), *parts)
-
-
-def _take(x: Any, at: np.ndarray) -> Any:
-    return x[at]
 
 
 def _piece_rows(disc: Discretization, nums: Numbers, cut: list[Class], shared: Any) -> list[Row]:
