@@ -66,44 +66,52 @@ def repaired(
     Tried in turn until L <= 1.5: 1.5 and 2.2 times the neighbours, then stencils with some
     neighbours from every direction. Particles with conditions of their own take no half measures.
     """
-    shared = dz.shared_elimination(disc, nums)
-    points = disc.images.searched(np.asarray(disc.cloud.points))
-    new_classes, new_rows = [], []
-    poor: dict[Any, list[tuple[Class, Row]]] = {}
-    sizes: dict[Any, int] = {}
+    new_classes, new_rows, touched = [], [], [np.zeros(0, int)]
+    # The pieces of a class are repaired together.
+    pieces: dict[Any, list[tuple[Class, Row, np.ndarray]]] = {}
     for cls, row in zip(classes, rows):
         weak = _score(row) > LEBESGUE
-        form = cls.scheme, cls.neighbours.shape[1]
-        sizes[form] = max(sizes.get(form, 0), int((cls.neighbours >= 0).sum(axis=1).max()))
-        if not weak.all():
-            keep = np.flatnonzero(~weak)
-            new_classes.append(_some(cls, keep) if weak.any() else cls)
-            new_rows.append(_take(row, keep) if weak.any() else row)
-        if weak.any():  # those of all pieces of a class are repaired together
-            at = np.flatnonzero(weak)
-            poor.setdefault(form, []).append((_some(cls, at), _take(row, at)))
-    touched = [np.zeros(0, int)]
-    for form, parts in poor.items():
-        some, few = zip(*parts)
-        ids, near = (np.concatenate([getattr(cls, x) for cls in some]) for x in ("ids", "neighbours"))
-        scheme, size = form[0], sizes[form]
-        best = _Best(Row(*map(np.concatenate, zip(*few))), near, bool(scheme.n_own))
-        width = min(len(points), round(2.2 * size))
-        for attempt in (_wider(1.5), _wider(2.2), _balanced(1.0), _balanced(1.5), _balanced(2.2)):
-            left = np.flatnonzero(best.lebesgue > LEBESGUE)
-            if not len(left):
-                break
-            # One shape for all attempts: compiling costs far more than computing a few rows twice.
-            left = np.resize(left, len(ids))
-            tried = attempt(points, ids[left], size)[:, :width]
-            # And few shapes for all clouds.
-            trial = Class(ids[left], _widened(tried, rounded_width(width, 16), 1, -1), scheme)
-            best.update(left, trial.neighbours, dz.class_rows(disc, nums, trial, shared))
-        new_classes.append(Class(ids, best.neighbours, scheme))
-        new_rows.append(best.row)
-        touched.append(ids[best.changed])
+        pieces.setdefault((cls.scheme, cls.wide), []).append((cls, row, np.flatnonzero(weak)))
+        if not weak.any():
+            new_classes.append(cls)
+            new_rows.append(row)
+        elif not weak.all():
+            new_classes.append(_some(cls, ~weak))
+            new_rows.append(_take(row, ~weak))
+    for found in pieces.values():
+        poor = [(_some(cls, at), _take(row, at)) for cls, row, at in found if len(at)]
+        if poor:
+            size = max(int((cls.neighbours >= 0).sum(axis=1).max()) for cls, *_ in found)
+            cls, row, changed = _repaired(disc, nums, poor, size)
+            new_classes.append(cls)
+            new_rows.append(row)
+            touched.append(changed)
     after = examine(new_classes, new_rows)
     return new_classes, new_rows, replace(after, repaired=np.concatenate(touched))
+
+
+def _repaired(
+    disc: Discretization, nums: Numbers, poor: list[tuple[Class, Row]], size: int
+) -> tuple[Class, Row, np.ndarray]:
+    """Weak particles of one class, whose stencils have up to ``size`` neighbours, with better ones; those changed."""
+    shared = dz.shared_elimination(disc, nums)
+    points = disc.images.searched(np.asarray(disc.cloud.points))
+    classes, rows = zip(*poor)
+    scheme, ids = classes[0].scheme, np.concatenate([cls.ids for cls in classes])
+    near = np.concatenate([cls.neighbours for cls in classes])
+    best = _Best(Row(*map(np.concatenate, zip(*rows))), near, bool(scheme.n_own))
+    width = min(len(points), round(2.2 * size))
+    for attempt in (_wider(1.5), _wider(2.2), _balanced(1.0), _balanced(1.5), _balanced(2.2)):
+        left = np.flatnonzero(best.lebesgue > LEBESGUE)
+        if not len(left):
+            break
+        # One shape for all attempts: compiling costs far more than computing a few rows twice.
+        left = np.resize(left, len(ids))
+        tried = attempt(points, ids[left], size)[:, :width]
+        # And few shapes for all clouds.
+        trial = Class(ids[left], _widened(tried, rounded_width(width, 16), 1, -1), scheme)
+        best.update(left, trial.neighbours, dz.class_rows(disc, nums, trial, shared))
+    return Class(ids, best.neighbours, scheme), best.row, ids[best.changed]
 
 
 # Moment matrices are looked at so many at a time, as many as one small program serves.

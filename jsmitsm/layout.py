@@ -25,12 +25,14 @@ from jsmitsm.tracers import is_traced
 class Class:
     """Particles whose moment systems have the same shape.
 
-    ids (n,) ascending, neighbours (n, w), the particle itself first and -1 for none.
+    ids (n,) ascending, neighbours (n, w), the particle itself first and -1 for none; wide: whether their stencils are
+    wider than those of most.
     """
 
     ids: np.ndarray
     neighbours: Any
     scheme: Scheme
+    wide: bool = False
 
 
 @dataclass
@@ -171,10 +173,10 @@ def sorted_classes(disc: Discretization, ids: np.ndarray, stencils: Stencils) ->
         near = np.pad(near, ((0, 0), (0, max(0, max(used) - near.shape[1]))), constant_values=-1)
     classes = []
     for count in np.unique(disc.n_own[ids]):
-        for some in (ids[(disc.n_own[ids] == count) & (wide == k)] for k in (False, True)):
+        for k, width in enumerate(used):
+            some = ids[(disc.n_own[ids] == count) & (wide == k)]
             if len(some):
-                width = used[int(wide[np.searchsorted(ids, some[0])])]
-                classes.append(Class(some, near[some][:, :width], replace(disc.scheme, n_own=int(count))))
+                classes.append(Class(some, near[some][:, :width], replace(disc.scheme, n_own=int(count)), bool(k)))
     return classes
 
 
