@@ -20,6 +20,7 @@ from jsmitsm.closure import Recovery
 from jsmitsm.eager import called, in_one_program, only_run
 from jsmitsm.kernels import Kernel
 from jsmitsm.moments import Block, Elimination, Row, Scheme, Support
+from jsmitsm.program import at_hand
 from jsmitsm.recursion import row_lifts
 from jsmitsm.tracers import closes_over_traced, is_traced, recorded
 
@@ -77,13 +78,6 @@ def padded_size(n: int, steps: int = 8) -> int:
     return -(-blocks // step) * step * _BLOCK
 
 
-def _size_at_hand(compiled: set[int], n: int, steps: int) -> int:
-    """The size class of n particles, or one that is compiled already and at most two classes too large."""
-    size = min((s for s in tuple(compiled) if n <= s <= (1 + 2 / steps) * n), default=padded_size(n, steps))
-    compiled.add(size)
-    return size
-
-
 def cloud_size(n: int) -> int:
     """The size class of a cloud of n particles, which are only looked up: few programs serve all clouds."""
     return max(_LEAST, 1 << (n - 1).bit_length())
@@ -115,7 +109,12 @@ def _all_padded(tree: Any, n: int, size: int) -> Any:
 @partial(in_one_program, static=("m",))
 def _cut(tree: Any, m: int) -> Any:
     """The first m particles. On the host where nothing is traced: an eager slice would compile for every length."""
-    return jax.tree.map(lambda x: (x if isinstance(x, jax.core.Tracer) else np.asarray(x))[:m], tree)
+    return jax.tree.map(lambda x: x[:m] if isinstance(x, jax.core.Tracer) else _first(np.asarray(x), m), tree)
+
+
+def _first(x: np.ndarray, m: int) -> np.ndarray:
+    """The first m rows; not a part of a much larger array, which would stay in memory with them."""
+    return x[:m] if len(x) <= 1.25 * m else x[:m].copy()
 
 
 def _in_size_classes(function: Any) -> Any:
@@ -130,9 +129,10 @@ def _in_size_classes(function: Any) -> Any:
         jac, one_for_all = operands.jac, operands.jac.shape[0] == 1
         big = cloud_size(n)
         # What is only run stops after m particles; derivatives are taken of all.
-        steps = 8 if recorded() or is_traced(points, kernel, ids, neighbours, operands, each, whole) else 2
-        form = scheme, big, neighbours.shape[1], jac.shape[1:], one_for_all, operands.shared is None, steps
-        size = _size_at_hand(compiled.setdefault(form, set()), m, steps)
+        loose = not (recorded() or is_traced(points, kernel, ids, neighbours, operands, each, whole))
+        form = scheme, big, neighbours.shape[1], jac.shape[1:], one_for_all, operands.shared is None, loose
+        known = compiled.setdefault(form, set())
+        size = at_hand(known, m, 2 * m, padded_size(m, 4)) if loose else at_hand(known, m, 1.25 * m, padded_size(m))
         points, kernel, data, whole = in_cloud_size((points, kernel, operands.data, whole), n)
         ids, neighbours, jac, own, each = _widened(
             (ids, neighbours, None if one_for_all else jac, operands.own, each), m, size
@@ -208,15 +208,15 @@ def _mapped(particle: Any, ids: Any, neighbours: Any, operands: Operands, *more:
     def one(args):
         i, near_ids, jac, own, *rest = args
         made = particle(i, near_ids, operands.jac[0] if one_for_all else jac, own, *rest)
-        empty.update({k: x for k, x in enumerate(jax.tree.leaves(made)) if not x.size})
+        empty.update({k: x.shape for k, x in enumerate(jax.tree.leaves(made)) if not x.size})
         return _without_empty(made)
 
     # Arrays without numbers cannot be cut into blocks: None stands for them on the way.
-    empty: dict[int, Any] = {}
+    empty: dict[int, tuple[int, ...]] = {}
     each = _without_empty([None if one_for_all else operands.jac, operands.own, *more])
     made = _in_blocks(one, (ids, neighbours, *each), operands.count)
     leaves, shape = jax.tree.flatten(made, is_leaf=lambda x: x is None)
-    full = [jnp.zeros((ids.shape[0], *empty[k].shape)) if k in empty else x for k, x in enumerate(leaves)]
+    full = [jnp.zeros((ids.shape[0], *empty[k])) if k in empty else x for k, x in enumerate(leaves)]
     return jax.tree.unflatten(shape, full)
 
 

@@ -39,7 +39,10 @@ _only_run: ContextVar[bool] = ContextVar("a program that is only run", default=F
 
 
 def only_run() -> bool:
-    """Whether no derivative will be taken of what is traced here: how often a loop runs may be a number of its own."""
+    """Whether no derivative will be taken of what is traced here: how often a loop runs may be a number of its own.
+
+    Only the programs that run are traced so; ``part``, of which derivatives are made, is not.
+    """
     return _only_run.get()
 
 

@@ -171,7 +171,7 @@ class Factorization:
         run = copy(self._run)  # the solution's own: what it says of itself must not change with the next
         run.problem, run.messages, run.against = problem, list(run.messages), list(run.against)
         x, good = run.solved(*self._matrix, right)
-        if self._factor is None and not is_traced(self._matrix):
+        if self._factor is None and not is_traced(self._matrix, x):
             self._factor = run.factor_of(*self._matrix)
         values = dz.with_held(disc, nums, x)
         traced = is_traced(values)

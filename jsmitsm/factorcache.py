@@ -102,8 +102,7 @@ def lookup(arrays: Sequence[Any], settings: Settings) -> tuple[Factor, bool]:
     pattern, order = None, None
     compared: dict[int, bool] = {}  # patterns by identity: comparing one takes milliseconds
     with _lock:
-        kept = _kept[::-1]
-        for factor in [*kept, *(other for other in list(_known) if other not in kept)]:
+        for factor in dict.fromkeys([*reversed(_kept), *_known]):
             matrix = _known[factor]
             other = matrix.pattern
             if id(other) not in compared:

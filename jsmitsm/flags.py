@@ -174,11 +174,10 @@ def _source(run: Any, values: np.ndarray, nums: Any, out: list[str], found: dict
             part[k] = np.abs(source[k] - predicted(points, source[k]))
     zero = np.zeros_like
     alone = replace(nums, source=part, held=zero(nums.held), given=zero(nums.given), gamma=zero(nums.gamma))
+    classes, rows = run.rows
     if disc.scheme.method in ("I", "II"):
-        rows = dz.all_rows(disc, alone)[1]  # their constant part holds the neighbours' sources
-    else:
-        rows = run.rows[1]
-    right = np.asarray(dz.right_side(disc, alone, run.rows[0], rows))
+        classes, rows = dz.all_rows(disc, alone)  # their constant part holds the neighbours' sources
+    right = np.asarray(dz.right_side(disc, alone, classes, rows))
     right = np.concatenate([right, np.zeros(len(disc.floating))])
     share = float(np.linalg.norm(run.factor.solve(right)) / (np.linalg.norm(values) or 1.0))
     found["source"] = share

@@ -21,7 +21,7 @@ def matrix(disc: Discretization, classes: list[Class], rows: list[Row]) -> tuple
     unknown, fields = disc.unknowns, disc.rec.fields
     parts: list[Any] = []
     places: list[Any] = []
-    for cls, row in zip(classes, rows):
+    for cls, row in zip(classes, rows, strict=True):
         near = disc.images.owners(cls.neighbours)
         xp: Any = jnp if is_traced(near) else np
         number = xp.asarray(unknown)
@@ -69,7 +69,7 @@ def right_side(disc: Discretization, nums: Numbers, classes: list[Class], rows: 
     """The global right-hand side (n,): source, own conditions and held neighbours."""
     unknown = disc.unknowns
     parts, places = [], []
-    for cls, row in zip(classes, rows):
+    for cls, row in zip(classes, rows, strict=True):
         source, given = right_sides(disc, nums, cls)
         near = disc.images.owners(cls.neighbours)
         own = unknown[cls.ids]

@@ -39,7 +39,7 @@ class Health:
 def examine(classes: list[Class], rows: list[Row]) -> Health:
     """Largest Lebesgue constant, weak particles, and those whose system is not determined."""
     health = Health()
-    for cls, row in zip(classes, rows):
+    for cls, row in zip(classes, rows, strict=True):
         lebesgue, defect = _worst(row)
         bad = ~np.isfinite(lebesgue) | ~(defect < _most(row))
         health.undetermined = np.append(health.undetermined, cls.ids[bad])
@@ -69,7 +69,7 @@ def repaired(
     new_classes, new_rows, touched = [], [], [np.zeros(0, int)]
     # The pieces of a class are repaired together.
     pieces: dict[Any, list[tuple[Class, Row, np.ndarray]]] = {}
-    for cls, row in zip(classes, rows):
+    for cls, row in zip(classes, rows, strict=True):
         weak = _score(row) > LEBESGUE
         pieces.setdefault((cls.scheme, cls.wide), []).append((cls, row, np.flatnonzero(weak)))
         if not weak.any():
@@ -111,7 +111,7 @@ def _repaired(
         # And few shapes for all clouds.
         trial = Class(ids[left], _widened(tried, rounded_width(width, 16), 1, -1), scheme)
         best.update(left, trial.neighbours, dz.class_rows(disc, nums, trial, shared))
-    return Class(ids, best.neighbours, scheme), best.row, ids[best.changed]
+    return Class(ids, best.neighbours, scheme, classes[0].wide), best.row, ids[best.changed]
 
 
 # Moment matrices are looked at so many at a time, as many as one small program serves.

@@ -15,6 +15,7 @@ from jsmitsm.moments import Scheme
 from jsmitsm.neighbours import Stencils
 from jsmitsm.periodic import Images, periodic_images, with_corners
 from jsmitsm.problem import Problem
+from jsmitsm.program import at_hand
 from jsmitsm.recursion import Recursion, free_indices, recursion
 from jsmitsm.supports import check_supports, cut_off, default_kernel, find_stencils
 from jsmitsm.trace import Traced, trace
@@ -194,10 +195,7 @@ def _width_at_hand(scheme: Scheme, width: int) -> int:
     """This width, or one at most an eighth larger that another cloud had: it finds its program compiled."""
     if len(_widths) >= _MOST_SCHEMES:
         _widths.clear()
-    known = _widths.setdefault(scheme, set())
-    width = min((w for w in tuple(known) if width <= w <= 1.125 * width), default=width)
-    known.add(width)
-    return width
+    return at_hand(_widths.setdefault(scheme, set()), width, 1.125 * width, width)
 
 
 def table(disc: Discretization) -> Any:

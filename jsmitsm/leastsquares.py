@@ -16,7 +16,7 @@ from jsmitsm.moments import Block
 from jsmitsm.neighbours import Stencils
 from jsmitsm.numbers import Numbers
 from jsmitsm.progress import each
-from jsmitsm.rows import around, in_pieces, operands, right_sides, shared_elimination
+from jsmitsm.rows import Around, around, in_pieces, operands, right_sides, shared_elimination
 from jsmitsm.tracers import is_traced
 
 
@@ -29,10 +29,10 @@ def least_squares(
     projector of a fit is idempotent, so nothing is squared. A list ``parts`` is filled with what
     :func:`least_squares_right_side` needs.
     """
-    shared = shared_elimination(disc, nums)
+    shared, there = shared_elimination(disc, nums), around(disc, nums)
 
     def one(cls: Class) -> tuple[Any, Any]:
-        block = _class_blocks(disc, nums, cls, shared)
+        block = _class_blocks(disc, nums, cls, shared, there)
         if parts is not None:
             parts.append((cls, block))
         return _normal_entries(disc, cls, block), _normal_load(disc, nums, cls, block)
@@ -49,9 +49,10 @@ def least_squares_right_side(disc: Discretization, nums: Numbers, parts: list[tu
 
 def misfit(disc: Discretization, nums: Numbers, values: Any) -> np.ndarray:
     """By how much each particle's value (N, F) misses its local fit, in the least-squares form."""
-    shared, own, found = shared_elimination(disc, nums), slice(0, disc.rec.fields), []
+    shared, there = shared_elimination(disc, nums), around(disc, nums)
+    own, found = slice(0, disc.rec.fields), []
     for cls in _fitted(disc, nums):
-        block = _class_blocks(disc, nums, cls, shared)
+        block = _class_blocks(disc, nums, cls, shared, there)
         near = np.maximum(disc.images.owners(cls.neighbours), 0)
         data = [np.asarray(x)[near].reshape(len(near), -1) for x in (values, nums.gamma)]
         fitted = np.einsum("nij,nj->ni", np.asarray(block.matrix)[:, own], np.concatenate(data, axis=1))
@@ -70,8 +71,7 @@ def _fitted(disc: Discretization, nums: Numbers) -> list[Class]:
     return in_pieces(disc, nums, whole)
 
 
-def _class_blocks(disc: Discretization, nums: Numbers, cls: Class, shared: Any) -> Block:
-    there = around(disc, nums)
+def _class_blocks(disc: Discretization, nums: Numbers, cls: Class, shared: Any, there: Around) -> Block:
     given = operands(disc, nums, cls, shared, there.data)
     return assembly.blocks(cls.scheme, there.points, there.kernel, cls.ids, cls.neighbours, given)
 

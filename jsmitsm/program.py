@@ -33,6 +33,13 @@ def kept(key: Any, make: Callable[[], Any]) -> Any:
     return made
 
 
+def at_hand(known: set[int], least: int, most: float, default: int) -> int:
+    """The smallest known size from ``least`` to ``most``, of which a program is compiled, or else ``default``."""
+    size = min((s for s in tuple(known) if least <= s <= most), default=default)
+    known.add(size)
+    return size
+
+
 def fingerprint(jaxpr: Any, rules: bool = True) -> Any:
     """A hashable value, equal for jaxprs that compute the same in the same way.
 

@@ -98,9 +98,9 @@ def _offsets(points: np.ndarray, ids: np.ndarray, neighbours: np.ndarray) -> lis
 
 def _verified(points: np.ndarray, ids: np.ndarray, found: Repeats, some: slice) -> bool:
     """Whether particles have the stencils of those that stand for them, to rounding."""
-    here, near, of = ids[some], found.neighbours[some], found.of[some]
-    few, stand = ids[found.first], found.neighbours[found.first]
-    if not np.array_equal(near >= 0, (stand >= 0)[of]):
+    near, others = found.neighbours[some], found.first[found.of[some]]
+    stand = found.neighbours[others]
+    if not np.array_equal(near >= 0, stand >= 0):
         return False
-    pairs = zip(_offsets(points, here, near), _offsets(points, few, stand))
-    return max(np.abs(x - y[of]).max() for x, y in pairs) <= _ROUNDING * np.abs(points).max()
+    pairs = zip(_offsets(points, ids[some], near), _offsets(points, ids[others], stand))
+    return max(np.abs(x - y).max() for x, y in pairs) <= _ROUNDING * np.abs(points).max()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from functools import partial
+from itertools import islice
 from typing import Any, NamedTuple
 
 import jax
@@ -118,7 +119,7 @@ def all_rows(disc: Discretization, nums: Numbers) -> tuple[list[Class], list[Row
     made = iter(_piece_rows(disc, nums, [piece for some in cut for piece in some], shared))
     classes, rows = [], []
     for cls, same, some in zip(disc.classes, found, cut):
-        parts = [next(made) for _ in some]
+        parts = list(islice(made, len(some)))
         if same is None:
             classes += some
             rows += parts
@@ -131,11 +132,11 @@ def all_rows(disc: Discretization, nums: Numbers) -> tuple[list[Class], list[Row
 
 def _repeats(disc: Discretization, nums: Numbers, cls: Class) -> Repeats | None:
     """Repeated stencils of a constant operator, which are set up once."""
-    one_size = disc.kernel is None or (not is_traced(disc.kernel) and np.ndim(disc.kernel.h) == 0)
-    if _work(nums, cls) < SMALLEST:
+    if _work(nums, cls) < SMALLEST or nums.jac.shape[-1] > 1 or cls.scheme.n_data:
         return None
+    one_size = disc.kernel is None or (not is_traced(disc.kernel) and np.ndim(disc.kernel.h) == 0)
     own = _own_conditions(nums, cls)
-    if not one_size or nums.jac.shape[-1] > 1 or cls.scheme.n_data or is_traced(cls.neighbours, disc.points, own):
+    if not one_size or is_traced(cls.neighbours, disc.points, own):
         return None
     return repeats(np.asarray(disc.points), cls.ids, cls.neighbours, np.asarray(own))
 
@@ -144,19 +145,20 @@ def _two_stage_rows(disc: Discretization, nums: Numbers, shared: Any) -> tuple[l
     """Methods I and II: recover every particle's coefficients, then insert them into the rows."""
     there = around(disc, nums)
     wide, far = _recovery_kernel(disc)
+    wide = assembly.in_cloud_size(wide, len(far))
     conditioned = np.zeros(len(disc.cloud), int)
     for group in disc.groups:
         conditioned[group.ids] = 0 if group.held else group.n_rows
-    whole = []
+    wholes = []
     for count in np.unique(conditioned):
         ids = np.flatnonzero(conditioned == count)
-        whole.append(Class(ids, far[ids], replace(disc.scheme, n_own=int(count))))
+        wholes.append(Class(ids, far[ids], replace(disc.scheme, n_own=int(count))))
 
     def recoveries(cls: Class) -> Recovery:
         given, sides = operands(disc, nums, cls, shared, there.data), right_sides(disc, nums, cls)
         return assembly.recoveries(cls.scheme, there.points, wide, cls.ids, cls.neighbours, given, sides)
 
-    cut = in_pieces(disc, nums, whole)
+    cut = in_pieces(disc, nums, wholes)
     parts = _on_all_cores("recoveries", recoveries, disc, nums, cut)
     xp = jnp if is_traced(parts) else np
     back = np.argsort(np.concatenate([cls.ids for cls in cut]))
@@ -164,15 +166,15 @@ def _two_stage_rows(disc: Discretization, nums: Numbers, shared: Any) -> tuple[l
     reach = _reach(disc.stencils.indices, far)
     known = assembly.in_cloud_size((far, recovered), len(far))
 
-    def rows(cls: Class) -> Row:
+    def closed(cls: Class) -> Row:
         given, reached = operands(disc, nums, cls, shared, there.data), (reach[cls.ids],)
         return assembly.closed_rows(
             cls.scheme, there.points, there.kernel, cls.ids, cls.neighbours, given, reached, known
         )
 
-    cut = in_pieces(disc, nums, disc.classes)
-    made = _on_all_cores("local fits", rows, disc, nums, cut)
-    return [replace(cls, neighbours=reach[cls.ids]) for cls in cut], made
+    classes = in_pieces(disc, nums, disc.classes)
+    made = _on_all_cores("local fits", closed, disc, nums, classes)
+    return [replace(cls, neighbours=reach[cls.ids]) for cls in classes], made
 
 
 def _reach(near: Any, far: Any) -> np.ndarray:
@@ -226,10 +228,9 @@ def _recovery_kernel(disc: Discretization) -> tuple[Kernel, Any]:
 
 def pieces(disc: Discretization, nums: Numbers, classes: list[Class], *more: Any) -> list[list[Class]]:
     """Every class in pieces of about one size (one program serves all), for the cores to share or a bar to move."""
-    total, worth = _total(classes), _worth(nums, classes)
-    shared = shown() or (cores() > 1 and jax.default_backend() == "cpu")
-    if total < 2 * worth or not shared or _transformed(disc, nums, classes, more):
+    if not _to_share(disc, nums, classes, *more) or not (shown() or (cores() > 1 and jax.default_backend() == "cpu")):
         return [[cls] for cls in classes]
+    total, worth = _total(classes), _worth(nums, classes)
     rounds = -(-min(-(-total // PIECE), MOST_PIECES) // cores())  # as many pieces for each core
     return [_cut(cls, max(-(-total // (rounds * cores())), worth)) for cls in classes]
 
@@ -248,11 +249,13 @@ def _worth(nums: Numbers, classes: list[Class]) -> int:
     return min(PIECE, _WORK // max((_work(nums, cls) for cls in classes), default=1) + 1)
 
 
-def _transformed(disc: Discretization, nums: Numbers, classes: list[Class], *more: Any) -> bool:
-    """Whether JAX traces something here, which holds in this thread alone."""
-    if recorded() or is_traced(disc.points, disc.kernel, vars(nums), [cls.neighbours for cls in classes], more):
-        return True
-    return disc.kernel is not None and closes_over_traced(disc.kernel.tree_flatten()[1])
+def _to_share(disc: Discretization, nums: Numbers, classes: list[Class], *more: Any) -> bool:
+    """Whether the classes are worth several cores; not where JAX traces something, which this thread alone may do."""
+    if _total(classes) < 2 * _worth(nums, classes) or recorded():
+        return False
+    if is_traced(disc.points, disc.kernel, vars(nums), [cls.neighbours for cls in classes], more):
+        return False
+    return disc.kernel is None or not closes_over_traced(disc.kernel.tree_flatten()[1])
 
 
 def _work(nums: Numbers, cls: Class) -> int:
@@ -276,11 +279,11 @@ def _on_all_cores(
     """``one`` of all classes, or pieces of them, side by side where nothing is traced."""
 
     def program(cls: Class) -> Any:
-        sizes = assembly.cloud_size(len(disc.points)), assembly.padded_size(len(cls.ids), 2), cls.neighbours.shape[1]
+        sizes = assembly.cloud_size(len(disc.points)), assembly.padded_size(len(cls.ids), 4), cls.neighbours.shape[1]
         return what, cls.scheme, sizes, disc.kernel is None
 
-    alone = _total(classes) < 2 * _worth(nums, classes) or _transformed(disc, nums, classes, more)
-    return each(what, one, classes, map if alone else partial(side_by_side, program=program))
+    mapped = partial(side_by_side, program=program) if _to_share(disc, nums, classes, *more) else map
+    return each(what, one, classes, mapped)
 
 
 def _joined(parts: list[Any]) -> Any:

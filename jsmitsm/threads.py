@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextvars import copy_context
 from functools import lru_cache
 from typing import Any
@@ -30,6 +30,10 @@ def side_by_side(function: Callable[[Any], Any], items: Sequence[Any], program: 
     program: of an item, what tells the compiled program behind it from others; until that has run once, an item of it
     runs alone.
     """
+    config: Any = jax.config
+    if config.jax_disable_jit or config.jax_debug_nans or config.jax_debug_infs:
+        yield from map(function, items)  # who looks for a fault wants it here
+        return
     made = {}
     for k, item in enumerate(items):
         key = program(item)
@@ -39,15 +43,13 @@ def side_by_side(function: Callable[[Any], Any], items: Sequence[Any], program: 
                 _ready.clear()
             _ready.add(key)
     left = [k for k in range(len(items)) if k not in made]
-    there, helping = _as_here(function), {}
-    if cores() > 1:
-        helping = {k: _helpers(cores() - 1).submit(copy_context().run, there, items[k]) for k in left[1:]}
+    helping = _begun(_as_here(function), {k: items[k] for k in left[1:]})
     # This thread begins with the first that is left, and goes on with those that no other has begun.
     mine = (k for k in left if k not in helping or helping[k].cancel())
     try:
         for k in range(len(items)):
             while k not in made:
-                next_one = next(mine, None)
+                next_one = None if k in helping and helping[k].done() else next(mine, None)
                 if next_one is not None:
                     made[next_one] = function(items[next_one])
                 else:
@@ -56,6 +58,15 @@ def side_by_side(function: Callable[[Any], Any], items: Sequence[Any], program: 
     finally:
         for task in helping.values():
             task.cancel()
+
+
+def _begun(function: Callable[[Any], Any], items: dict[Any, Any]) -> dict[Any, Future[Any]]:
+    """The items handed to the other cores; none where there are no others, nor where Python is ending."""
+    others = cores() - 1
+    try:
+        return {k: _helpers(others).submit(copy_context().run, function, x) for k, x in items.items()} if others else {}
+    except RuntimeError:
+        return {}
 
 
 @lru_cache(maxsize=1)

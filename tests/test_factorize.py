@@ -56,6 +56,25 @@ def test_its_factors_stay_whatever_else_is_solved():
     assert np.isclose(grad, np.sum(ready.solve(poisson(1.0)).u - ready.solve(poisson(0.0)).u))
 
 
+def test_under_jit_a_singular_system_gives_nan():
+    """The second of two squares far apart has no value that holds it."""
+    square = js.rectangle((0, 0), (1, 1), (13, 13))
+    one, sides = np.asarray(square.points), np.concatenate([square.groups[side] for side in SIDES])
+    out = np.sign(np.where(np.abs(one - 0.5) == 0.5, one - 0.5, 0.0))
+    normals = np.full((338, 2), np.nan)
+    for k in (0, 169):
+        normals[sides + k] = out[sides] / np.linalg.norm(out[sides], axis=1, keepdims=True)
+    groups = {"interior": np.setdiff1d(np.arange(338), [*sides, *(sides + 169)]), "held": sides, "loose": sides + 169}
+    cloud = js.Cloud(np.concatenate([one, one + [50.0, 0.0]]), groups, normals)
+    posed = lambda s: js.Problem(
+        lambda u, x: js.laplacian(u)(x) - s, {"held": js.dirichlet(0.0), "loose": js.neumann(0.0)}
+    )
+    ready = js.factorize(posed(0.0), cloud)
+    assert np.isnan(jax.jit(lambda s: ready.solve(posed(s)).u)(0.0)).any()
+    with pytest.raises(js.SolveError, match="singular"):
+        ready.solve(posed(0.0))
+
+
 def test_the_form_may_be_given():
     forms = {form: js.factorize(heat(1.0), CLOUD, formulation=form).solve(heat(2.0)).u for form in ("loo", "lsq")}
     for form, u in forms.items():

@@ -61,6 +61,46 @@ def test_results_come_in_order_and_calls_inside_of_calls_end(two_cores):
     assert np.ravel(rows).tolist() == list(range(100))
 
 
+def test_results_are_handed_on_while_others_are_made(two_cores):
+    """Another thread has done item 1 long before this one would be through with the rest: it moves a bar at once."""
+    list(threads.side_by_side(lambda k: k, range(1), lambda _: "handed on"))
+    seen = threading.Event()
+
+    def made(k):
+        if k != 1:
+            time.sleep(0.1)
+        return seen.wait(5.0) if k == 5 else True
+
+    for k, result in enumerate(threads.side_by_side(made, range(6), lambda _: "handed on")):
+        if k == 1:
+            seen.set()
+        assert result, "item 5 waited in vain for item 1 to arrive"
+
+
+def test_who_looks_for_a_fault_gets_it_here(two_cores):
+    list(threads.side_by_side(named, range(1), lambda _: "names"))
+    with jax.debug_nans(True):
+        assert set(threads.side_by_side(named, range(4), lambda _: "names")) == {threading.main_thread().name}
+
+
+def test_flags_do_not_depend_on_how_the_cloud_was_cut(two_cores, monkeypatch):
+    cloud = js.rectangle((0, 0), (1, 1), (21, 21))
+    problem = js.Problem(lambda u, x: js.laplacian(u)(x) - jax.numpy.sin(8 * x[0]), SIDES)
+    sol = js.solve(problem, cloud, method="I", order=2, kernel=js.Gaussian(2.2 * cloud.spacing, 2.0))
+    monkeypatch.setattr(rows, "cores", lambda: 1)
+    assert isinstance(sol.flags, list)
+
+
+def test_methods_of_two_stages_share_programs_too():
+    problem = js.Problem(lambda u, x: js.laplacian(u)(x) - 1.0, {"left": js.dirichlet(0.0), "right": js.dirichlet(0.0)})
+    counts = []
+    for n in (150, 151, 153):
+        before = assembly.TRACES["rows"]
+        js.solve(problem, js.interval(0.0, 1.0, n), method="II", order=4, kernel=js.Gaussian(2.2 / (n - 1), 2.0))
+        counts.append(assembly.TRACES["rows"] - before)
+    assert counts[0] >= 2 and counts[1:] == [0, 0]
+
+
 def test_the_precision_of_the_caller_holds(two_cores):
     narrow = jax.enable_x64 if hasattr(jax, "enable_x64") else jax.experimental.enable_x64
     with narrow(False):
