@@ -192,10 +192,14 @@ _MOST_SCHEMES = 256
 
 
 def _width_at_hand(scheme: Scheme, width: int) -> int:
-    """This width, or one at most an eighth larger that another cloud had: it finds its program compiled."""
+    """This width, or one little larger that another cloud had: it finds its program compiled.
+
+    In 3D, where widths vary more and compiling takes longer, up to a quarter larger; else an eighth.
+    """
     if len(_widths) >= _MOST_SCHEMES:
         _widths.clear()
-    return at_hand(_widths.setdefault(scheme, set()), width, 1.125 * width, width)
+    most = (1.25 if scheme.rec.dim == 3 else 1.125) * width
+    return at_hand(_widths.setdefault(scheme, set()), width, most, width)
 
 
 def table(disc: Discretization) -> Any:

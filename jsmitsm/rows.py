@@ -30,6 +30,8 @@ from jsmitsm.tracers import closes_over_traced, is_traced, recorded
 # Particles that the cores share in pieces, between whose ends a progress bar moves. Every piece costs a millisecond, so
 # it has some four of work: _WORK entries of matrices to be made, about.
 PIECE, MOST_PIECES, _WORK = 16384, 32, 1_200_000
+# Bytes of an array that takes longer to copy than to be sent apart.
+_LARGE = 1 << 20
 # What the systems of other methods take, measured by those of S.
 _TIMES = {"I": 8, "II": 8, "III": 4}
 # Lengths that share an elimination differ by less than this ratio; particles that each elimination must serve.
@@ -47,7 +49,13 @@ class Around(NamedTuple):
 def around(disc: Discretization, nums: Numbers) -> Around:
     """What the particles of all classes look up."""
     given = disc.points, disc.kernel, disc.images.extend_values(nums.data)
-    return Around(*assembly.in_cloud_size(given, len(disc.points)))
+    return Around(*_sent(assembly.in_cloud_size(given, len(disc.points))))
+
+
+def _sent(tree: Any) -> Any:
+    """Large arrays sent to the device once, not again with every piece."""
+    large = lambda x: isinstance(x, np.ndarray) and x.nbytes > _LARGE  # noqa: E731
+    return jax.tree.map(lambda x: jax.device_put(x) if large(x) else x, tree)
 
 
 def operands(disc: Discretization, nums: Numbers, cls: Class, shared: Elimination | None, data: Any) -> Operands:
@@ -164,7 +172,7 @@ def _two_stage_rows(disc: Discretization, nums: Numbers, shared: Any) -> tuple[l
     back = np.argsort(np.concatenate([cls.ids for cls in cut]))
     recovered = jax.tree.map(lambda *x: xp.concatenate(x)[back], *parts)
     reach = _reach(disc.stencils.indices, far)
-    known = assembly.in_cloud_size((far, recovered), len(far))
+    known = _sent(assembly.in_cloud_size((far, recovered), len(far)))
 
     def closed(cls: Class) -> Row:
         given, reached = operands(disc, nums, cls, shared, there.data), (reach[cls.ids],)
@@ -342,7 +350,7 @@ def all_coefficients(disc: Discretization, nums: Numbers, values: Any) -> Any:
     """Taylor coefficients (N, F, K) of the particles of all classes, from all values u (N, F); zeros elsewhere."""
     shared, there = shared_elimination(disc, nums), around(disc, nums)
     known = disc.images.extend_values(values), disc.images.extend_values(nums.gamma)
-    known = assembly.in_cloud_size(known, len(disc.points))
+    known = _sent(assembly.in_cloud_size(known, len(disc.points)))
 
     def one(cls: Class) -> Any:
         given = operands(disc, nums, cls, shared, there.data)
