@@ -58,6 +58,24 @@ def nested_dissection(rows: np.ndarray, cols: np.ndarray, points: np.ndarray, le
     return along[np.argsort(key[along], kind="stable")]
 
 
+def spatial_order(points: np.ndarray, leaf: int = LEAF) -> np.ndarray:
+    """The unknowns region by region, neighbours near one another: for what sweeps over a matrix and eliminates nothing.
+
+    ``points``, ``leaf`` and what comes back as for :func:`nested_dissection`, which takes eight times as long.
+
+    Example:
+      >>> spatial_order(np.array([[2.0], [0.0], [1.0]]))
+      array([1, 2, 0])
+    """
+    points = np.asarray(points, dtype=float)
+    placed = np.isfinite(points).all(axis=1)
+    inner = np.flatnonzero(placed)
+    here = points[inner]
+    flat = points.shape[1] == 1 or len(inner) <= leaf
+    order = np.argsort(here[:, 0], kind="stable") if flat else _halve(here, leaf)[2]
+    return np.concatenate([inner[order], np.flatnonzero(~placed)])
+
+
 def _halve(points: np.ndarray, leaf: int) -> tuple[np.ndarray, int, np.ndarray]:
     """Binary code of every point's region, digits of the code, and the points in spatial order."""
     n, dim = points.shape

@@ -22,12 +22,14 @@ from jsmitsm.collector import uncollected
 from jsmitsm.conditioning import inverse_norm, near_null_vector
 from jsmitsm.errors import SingularMatrix
 from jsmitsm.interrupts import interruptible
-from jsmitsm.ordering import nested_dissection
+from jsmitsm.ordering import nested_dissection, spatial_order
 from jsmitsm.progress import bar
 
 BACKWARD_ERROR = 1e-9  # what is accepted of a direct solver
 BACKWARD_ERROR_ITERATIVE = 1e-12  # of an iterative one, which reaches round-off unless it stalls
 SINGULAR = 1e15  # condition number (scaled) above which no digit of a solution means anything
+# Backends that live on what is left of a matrix's symmetry, and eliminate nothing.
+MULTIGRID = ("amg", "device amg")
 # Unknowns from which a factorisation may take seconds: a thread costs less than a millisecond.
 LONG = 10_000
 COUNTS = {"factorisations": 0}
@@ -96,13 +98,14 @@ class Factor:
             "messages": self.messages,
         }
         self._backends = choose_backends(n, len(data), points, solver, elliptic)
-        rows_only = self._backends[0] in ("amg", "device amg", "ilu")  # multigrid lives on what is left of the symmetry
+        rows_only = self._backends[0] in (*MULTIGRID, "ilu")
         self.row_scale, self.col_scale = _scales(data, rows, cols, n, columns=not rows_only)
         scaled = data * self.row_scale[rows] * self.col_scale[cols]
         started = time.perf_counter()
-        self.order = order
+        self.order, self._points = order, points
         if order is None and points is not None and n > DENSE_MAX and self._backends[0] != "pardiso":
-            self.order = nested_dissection(rows, cols, np.asarray(points))
+            multigrid = self._backends[0] in MULTIGRID
+            self.order = spatial_order(points) if multigrid else nested_dissection(rows, cols, np.asarray(points))
         if self.order is not None:
             place = np.empty(n, np.int32)
             place[self.order] = np.arange(n, dtype=np.int32)
@@ -139,8 +142,7 @@ class Factor:
             before, after = after, before
         rhs = before[:, None] * wide
         with self._lock:
-            ordered = rhs if self.order is None else rhs[self.order]
-            x = self._in_callers_order(self._solve_scaled(ordered, transpose))
+            x = self._solve_scaled(rhs, transpose)
         x *= after[:, None]
         x[:, ~finite] = np.nan
         self.info["seconds"]["solve"] = time.perf_counter() - started
@@ -184,22 +186,22 @@ class Factor:
         return out
 
     def _solve_scaled(self, b: np.ndarray, transpose: bool) -> np.ndarray:
-        """Solve with the scaled, ordered matrix; change the backend where one fails."""
+        """Solve with the scaled matrix; change the backend, and with it the order, where one fails."""
         while True:
             self._lu.iterations, self._lu.stalled = 0, False
-            x, error = self._refined(b, transpose)
+            x, error = self._refined(b if self.order is None else b[self.order], transpose)
             self.info.update(residual=error, iterations=self._lu.iterations)
             backend, stalled = self._backends[0], self._lu.stalled
             strict = backend in ITERATIVE and self.refine
             small = error <= (BACKWARD_ERROR_ITERATIVE if strict else BACKWARD_ERROR)
             if small and not stalled:
-                return x
+                return self._in_callers_order(x)
             told = f"{'stalled at' if stalled else 'left'} a residual of {error:.1e}"
             if self._give_way(told):
                 continue
             if small:
                 self.messages.append(f"{backend} {told}; a direct solver needs too much memory")
-                return x
+                return self._in_callers_order(x)
             raise SingularMatrix(
                 f"the linear system cannot be solved: {backend} {told} after refinement",
                 _largest(self.near_null_vector()),
@@ -211,8 +213,17 @@ class Factor:
             return False
         backend = self._backends.pop(0)
         self.messages.append(f"{backend} {told}; {self._backends[0]} took over")
+        if backend in MULTIGRID and self.order is not None and self._points is not None:
+            self._dissect()
         self._factorise()
         return True
+
+    def _dissect(self) -> None:
+        """Put the matrix in the order in which it may be eliminated."""
+        assert self.order is not None
+        entries = self.matrix.tocoo()
+        order = nested_dissection(entries.coords[0], entries.coords[1], np.asarray(self._points)[self.order])
+        self.order, self.matrix = self.order[order], self.matrix[order][:, order]
 
     def _refined(self, b: np.ndarray, transpose: bool) -> tuple[np.ndarray, float]:
         """Solution with its residual corrected until that no longer helps, and backward error."""

@@ -473,6 +473,23 @@ def test_pardiso_where_installed(monkeypatch):
         sparse.Factor(matrix[rows, cols], rows, cols, 400, points, "sparse")
 
 
+def test_multigrid_that_stalls_leaves_an_order_for_elimination(monkeypatch):
+    """Its own, which only keeps neighbours together, would fill the factors."""
+    pytest.importorskip("pyamg")
+    data, rows, cols, points = grid(40)
+    b = np.random.default_rng(0).random(1600)
+    want = sparse.Factor(data, rows, cols, 1600, points, "sparse")
+    smooth = sparse.Factor(data, rows, cols, 1600, points, "iterative")
+    assert smooth.info["backend"] == "amg" and (smooth.order != want.order).any()
+    np.testing.assert_allclose(smooth.solve(b), want.solve(b), rtol=1e-10)
+    monkeypatch.setattr(backends.Krylov, "most", 2)
+    stalled = sparse.Factor(data, rows, cols, 1600, points, "iterative")
+    for transpose in (False, True):
+        np.testing.assert_allclose(stalled.solve(b, transpose), want.solve(b, transpose), rtol=1e-10)
+    assert stalled.info["backend"] == "nested dissection"
+    assert stalled.info["factor_entries"] < 1.2 * want.info["factor_entries"]
+
+
 def test_stalled_iteration_falls_back(monkeypatch):
     data, rows, cols, points = grid(20)
     monkeypatch.setattr(backends.Krylov, "most", 2)
