@@ -12,7 +12,7 @@ from jsmitsm.eager import in_one_program
 from jsmitsm.layout import Class, Discretization
 from jsmitsm.moments import Row
 from jsmitsm.numbers import Numbers
-from jsmitsm.rows import right_sides
+from jsmitsm.operands import right_sides
 from jsmitsm.tracers import is_traced
 
 

@@ -15,8 +15,8 @@ from jsmitsm.layout import Class, Discretization, sorted_classes, table
 from jsmitsm.moments import Block
 from jsmitsm.neighbours import Stencils
 from jsmitsm.numbers import Numbers
-from jsmitsm.progress import each
-from jsmitsm.rows import Around, around, in_pieces, operands, right_sides, shared_elimination
+from jsmitsm.operands import Around, around, operands, right_sides, shared_elimination
+from jsmitsm.pieces import in_pieces, on_all_cores
 from jsmitsm.tracers import is_traced
 
 
@@ -31,13 +31,14 @@ def least_squares(
     """
     shared, there = shared_elimination(disc, nums), around(disc, nums)
 
-    def one(cls: Class) -> tuple[Any, Any]:
+    def one(cls: Class) -> tuple[Any, Any, Any]:
         block = _class_blocks(disc, nums, cls, shared, there)
-        if parts is not None:
-            parts.append((cls, block))
-        return _normal_entries(disc, cls, block), _normal_load(disc, nums, cls, block)
+        kept = None if parts is None else (cls, block)
+        return _normal_entries(disc, cls, block), _normal_load(disc, nums, cls, block), kept
 
-    entries, loads = zip(*each("local fits", one, _fitted(disc, nums)))
+    entries, loads, kept = zip(*on_all_cores("local fits", one, disc, nums, _fitted(disc, nums)))
+    if parts is not None:
+        parts += kept
     return *joined(entries), _added_up(*zip(*loads), np.zeros(_unknown_count(disc)))
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import jsmitsm as js
-from jsmitsm import backends, progress, rows
+from jsmitsm import backends, pieces, progress
 
 pytest.importorskip("tqdm")
 ENDS = {"left": js.dirichlet(0.0), "right": js.dirichlet(0.0)}
@@ -30,7 +30,7 @@ def watch(monkeypatch):
     monkeypatch.delenv("TQDM_DISABLE", raising=False)
     monkeypatch.setattr(progress, "DELAY", 0.0)
     monkeypatch.setattr(progress, "PAUSE", 0.0)
-    monkeypatch.setattr(rows, "PIECE", 4)
+    monkeypatch.setattr(pieces, "PIECE", 4)
     monkeypatch.setattr(sys, "stderr", Terminal())
     return sys.stderr.getvalue
 
