@@ -129,7 +129,8 @@ def _in_size_classes(function: Any) -> Any:
         jac, one_for_all = operands.jac, operands.jac.shape[0] == 1
         big = cloud_size(n)
         # What is only run stops after m particles; derivatives are taken of all.
-        loose = not (recorded() or is_traced(points, kernel, ids, neighbours, operands, each, whole))
+        inside = recorded()
+        loose = not (inside or is_traced(points, kernel, ids, neighbours, operands, each, whole))
         form = scheme, big, neighbours.shape[1], jac.shape[1:], one_for_all, operands.shared is None, loose
         known = compiled.setdefault(form, set())
         size = at_hand(known, m, 2 * m, padded_size(m, 4)) if loose else at_hand(known, m, 1.25 * m, padded_size(m))
@@ -140,7 +141,7 @@ def _in_size_classes(function: Any) -> Any:
         jac, count = operands.jac if one_for_all else jac, np.int32(m)
         given = Operands(jac, own, data, operands.shared, operands.lengths, count)
         arguments = dict(zip(names, (points, kernel, ids, neighbours, given, each, whole)))
-        if recorded() or (kernel is not None and closes_over_traced(kernel.tree_flatten()[1])):
+        if inside or (kernel is not None and closes_over_traced(kernel.tree_flatten()[1])):
             return _cut(inner(scheme, **arguments), m)
         options = next(some for most, some in _EFFORT if size <= most) if jax.default_backend() == "cpu" else {}
         most = _SMALL if operands.shared is None else _SMALL_SHARED
