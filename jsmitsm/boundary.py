@@ -278,7 +278,8 @@ def in_words(error: Exception) -> str:
         return (f"{text.splitlines()[0]} It must be written in jax.numpy: jnp.sin for np.sin or math.sin, "
                 "jnp.where for an if")  # fmt: skip
     if isinstance(error, IndexError):
-        return f"{text}; x is one point of shape (D,), x[0] its first coordinate"
+        return (f"{text}; x is one point of shape (D,), x[0] its first coordinate; u(x) is a number, and a vector (F,) "
+                "with js.Problem(..., fields=F)")  # fmt: skip
     return text
 
 

@@ -566,3 +566,10 @@ def test_one_of_a_stack_of_solutions_is_a_solution(stacked):
     one, same = jax.tree.map(lambda x: x[1], several), alone(2.0)
     for ask in (lambda sol: sol.u, lambda sol: sol([[0.3]]), lambda sol: sol.error_estimate()):
         assert np.allclose(ask(one), ask(same), rtol=0, atol=1e-13)
+
+
+def test_fields_of_a_system_left_out():
+    """u(x)[1] of what is one field: the remedy is named."""
+    pde = lambda u, x: [js.laplacian(u)(x)[0] - u(x)[1], js.laplacian(u)(x)[1]]
+    with pytest.raises(ValueError, match=r"pde: .*fields=F"):
+        js.solve(js.Problem(pde, {"left": js.dirichlet(0.0), "right": js.dirichlet(0.0)}), js.interval(0.0, 1.0, 9))
