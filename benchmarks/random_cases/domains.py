@@ -11,7 +11,7 @@ import numpy as np
 import jsmitsm as js
 from benchmarks import scenes
 
-SIZES = {1: (15, 21, 41, 61), 2: (9, 13, 17, 21), 3: (5, 6, 7, 8)}
+SIZES = {1: (15, 21, 41, 61), 2: (9, 13, 17), 3: (5, 6, 7)}
 
 
 def _box(dim: int, n: int, jitter: float, seed: int) -> js.Cloud:
