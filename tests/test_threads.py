@@ -19,7 +19,7 @@ PROBLEM = js.Problem(lambda u, x: (1.0 + x[0]) * js.laplacian(u)(x) + 1.0, SIDES
 @pytest.fixture
 def two_cores(monkeypatch):
     monkeypatch.setattr(sharing, "PIECE", 64)
-    for module in (pieces, threads):
+    for module in (sharing, threads):
         monkeypatch.setattr(module, "cores", lambda: 2)
 
 
