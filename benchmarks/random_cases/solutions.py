@@ -48,6 +48,15 @@ def layer(x: Any, p: Any) -> Any:
     return _rest(x, p) + p["size"] * jnp.exp(-(p["direction"] @ x - p["start"]) / p["width"])
 
 
+def laminate(x: Any, q: Any) -> Any:
+    """The integral of 1 / k along the direction in which the conductivity k = 1 + c (1 + tanh s) steps."""
+    s = q["across"] @ (x - q["at"]) / q["steep"]
+    a, c = 1.0 + q["contrast"], q["contrast"]
+    # log(a cosh s + c sinh s), which does not overflow.
+    log = jnp.abs(s) + jnp.log(0.5 * (a + c * jnp.sign(s) + (a - c * jnp.sign(s)) * jnp.exp(-2.0 * jnp.abs(s))))
+    return (a * s - c * log) / (a**2 - c**2)
+
+
 SOLUTIONS: dict[str, Callable[[Any, Any], Any]] = {
     f.__name__: f for f in (smooth, wave, standing, peak, pole, front, layer)
 }
@@ -56,6 +65,8 @@ SOLUTIONS: dict[str, Callable[[Any, Any], Any]] = {
 @lru_cache(maxsize=None)
 def exact(name: str, fields: int) -> Callable[[Any, Any], Any]:
     """The solution (x, q), a scalar or (F,), from the numbers q["fields"]."""
+    if name == "laminate":
+        return laminate
     one = SOLUTIONS[name]
     if fields == 1:
         return lambda x, q: one(x, q["fields"][0])

@@ -19,6 +19,8 @@ from jsmitsm.discretization.leave_one_out import right_side
 from jsmitsm.discretization.operator_kind import cell_peclet, mean_spacing, wave_number
 from jsmitsm.discretization.rows import all_rows
 from jsmitsm.runtime.errors import some
+from jsmitsm.solution.between import between
+from jsmitsm.solution.steepness import steepness, unseen
 
 # A particle may differ from the linear function through its neighbours by this part of the
 # range; a sine of six particles a wavelength differs by 0.25. By order: up to 3, and above.
@@ -37,20 +39,23 @@ MISFIT = 0.01
 PECLET = 1.0
 # Round-off of the moment systems times the condition: this leaves two digits.
 ROUND_OFF = 1e-2
+# A field's range below this part of its values is round-off, and so is a field below this part of the largest.
+FLAT, NOTHING = 1e-9, 1e-10
 # Coordinates rounded by this part of the spacing put the particles somewhere else.
 ROUNDED = 1e-3
 # (k s)^(p+1) cells, with s the spacing: the phase error a wave gathers across the domain. By order, as above.
 PHASE = (0.9, 3.5)
 
 
-# An estimated error below this part of the solution clears what only suspects the resolution. Of the wrong
-# solutions of the stability sweep that were flagged for nothing else, the least estimate is 0.07.
-CLEARED = 0.01
-# This part of the bounds above is reason enough to ask the estimate, and nothing to say before it has answered.
+# An estimated error below this part of the solution clears what only suspects the resolution ...
+CLEARED = 0.03
+# ... unless what is missed between the particles would make so much of the solution.
+MISSED = 0.5
+# Measures below this part of their bounds clear a solution without an estimate. Fronts are wrong by their whole size
+# at a third of the bounds.
 HINT = 0.3
-# The estimate passes through the same inverse: near a resonance it is blind, and a condition so many times the usual
-# one clears nothing.
-CALM = 10.0
+# The operator's coefficients at a neighbour differ from their Taylor polynomials by this part of the largest term.
+COEFFICIENT = 0.3
 # Beyond so many particles an error estimate would cost more than a look at the flags may.
 MANY = 200_000
 
@@ -58,48 +63,65 @@ MANY = 200_000
 def flags(run: Any, values: Any, nums: Any, estimated: Callable[[], float]) -> tuple[list[str], dict[str, float]]:
     """Sentences, none for a healthy solution, and the measures behind them.
 
-    estimated: the estimated error over the solution, asked for where that may clear or confirm a suspicion.
+    estimated: the estimated error as a part of the solution, asked for unless the cheap tests clear the solution, which they can do for linear problems of one field
+    in the leave-one-out form, or find what no estimate can excuse.
     """
     values = np.asarray(values, float)
     if not np.isfinite(values).all():
         return ["The values are not finite."], {}
-    known: list[str] = []
-    suspected: list[str] = []
+    certain: list[str] = []
+    doubts: list[str] = []
     found: dict[str, float] = {}
-    for test in (_condition, _misfit, _far_away, _waves):
-        test(run, values, nums, known, found)
-    for test in (_roughness, _source, _weakness, _peclet):
-        test(run, values, nums, suspected, found)
-    if not known and _telling(run) and (suspected or _hinted(found, run.disc.rec.order)):
-        found["estimate"] = estimated()
-        if found["estimate"] <= CLEARED and found.get("excess", np.inf) <= CALM:
-            suspected = []
-    return suspected + known, found
+    for test in (_round_off, _far_away, _jumps):
+        test(run, values, nums, certain, found)
+    for test in (_condition, _misfit, _waves, _roughness, _source, _coefficients, _weakness, _peclet):
+        test(run, values, nums, doubts, found)
+    if certain or len(run.disc.cloud) > MANY or _cleared(run, found, doubts):
+        return doubts + certain, found
+    found["estimate"] = estimated()
+    if found["estimate"] > CLEARED:
+        return doubts, found
+    found["missed"] = missed = share(between(run.disc, nums, run.problem, values, run.rows, run.factor), values)
+    if missed <= MISSED:
+        return [], found
+    return [
+        f"Between the particles the equation is missed by as much as makes {missed:.0%} of the solution: the source or a "
+        "coefficient changes within the spacing, unseen by the particles; refine there, or smooth it."
+    ], found
 
 
-def _telling(run: Any) -> bool:
-    """Whether the error estimate is known to be large where the solution is wrong.
-
-    It is not in the least-squares form; systems and nonlinear problems are not in the stability sweep.
-    """
+def _cleared(run: Any, found: dict[str, float], doubts: list[str]) -> bool:
+    """Whether the cheap tests are enough to call a solution healthy."""
     disc = run.disc
-    return run.formulation == "loo" and disc.linear and disc.rec.fields == 1 and len(disc.cloud) <= MANY
+    if doubts or run.formulation == "lsq" or not disc.linear or disc.rec.fields > 1:
+        return False
+    high = disc.rec.order > 3
+    bounds = {"roughness": ROUGH[high], "source": SOURCE, "wave": PHASE[high], "excess": 10.0 / HINT,
+              "coefficient": COEFFICIENT}  # fmt: skip
+    return all(found.get(name, 0.0) <= HINT * bound for name, bound in bounds.items())
 
 
-def _hinted(found: dict[str, float], order: int) -> bool:
-    """Whether a measure comes near its bound: fronts are wrong by their whole size at a third of the bounds."""
-    high = order > 3
-    bounds = {"roughness": ROUGH[high], "source": SOURCE, "wave": PHASE[high], "excess": CALM / HINT}
-    return any(found.get(name, 0.0) > HINT * bound for name, bound in bounds.items())
+def share(error: np.ndarray, values: np.ndarray) -> float:
+    """Errors (N, F) over the values (N, F), of the worst field: each has a scale of its own."""
+    size = np.abs(values).max(initial=0.0) or 1.0  # no square overflows
+    fields = np.linalg.norm(values / size, axis=0)
+    scale = np.maximum(fields, NOTHING * fields.max(initial=0.0))
+    return float(np.max(np.linalg.norm(error / size, axis=0) / np.where(scale > 0, scale, 1.0)))
+
+
+def scales(values: np.ndarray) -> np.ndarray:
+    """The range of each field (F,), not below the round-off of the values: a constant has no range of its own."""
+    size = np.abs(values).max(axis=0, initial=0.0)
+    scale = np.maximum(np.ptp(values, axis=0), np.maximum(FLAT * size, NOTHING * size.max(initial=0.0)))
+    return np.where(scale > 0, scale, 1.0)
 
 
 def _roughness(run: Any, values: np.ndarray, nums: Any, out: list[str], found: dict[str, float]) -> None:
     disc = run.disc
     points = np.asarray(disc.cloud.points, float)
     rough = np.zeros(len(values))
-    for f in range(values.shape[1]):
-        spread = float(np.ptp(values[:, f])) or 1.0
-        away = np.abs(values[:, f] - predicted(points, values[:, f])) / spread
+    for f, scale in enumerate(scales(values)):
+        away = np.abs(values[:, f] - predicted(points, values[:, f])) / scale
         rough = np.maximum(rough, np.where(disc.held[:, f], 0.0, away))
     found["roughness"] = float(rough.max(initial=0.0))
     bad = np.flatnonzero(rough > ROUGH[disc.rec.order > 3])
@@ -132,7 +154,6 @@ def _condition(run: Any, values: np.ndarray, nums: Any, out: list[str], found: d
         return
     rec = run.disc.rec
     order = max(rec.order - q for q in rec.degrees)
-    found["condition"] = run.factor.condition()
     usual = len(values) ** ((2 if run.formulation == "lsq" else 1) * order / rec.dim)
     found["excess"] = found["condition"] / usual
     if found["excess"] > SINGULAR[run.formulation]:
@@ -140,6 +161,12 @@ def _condition(run: Any, values: np.ndarray, nums: Any, out: list[str], found: d
             f"The global system is nearly singular (condition {found['condition']:.1e}, {usual:.0e} is usual): the "
             "operator is near a resonance, particles nearly coincide, or the supports couple them badly."
         )
+
+
+def _round_off(run: Any, values: np.ndarray, nums: Any, out: list[str], found: dict[str, float]) -> None:
+    if run.factor is None:
+        return
+    found["condition"] = run.factor.condition()
     if run.rows is None:
         found["round_off"] = float(np.finfo(float).eps) * found["condition"]
         if found["round_off"] > ROUND_OFF:
@@ -190,6 +217,32 @@ def _source(run: Any, values: np.ndarray, nums: Any, out: list[str], found: dict
         )
 
 
+def _coefficients(run: Any, values: np.ndarray, nums: Any, out: list[str], found: dict[str, float]) -> None:
+    if np.shape(nums.jac)[-1] == 1:
+        return
+    steep = steepness(run.disc, nums)
+    found["coefficient"] = float(steep.max(initial=0.0))
+    bad = np.flatnonzero(steep > COEFFICIENT)
+    if len(bad):
+        out.append(
+            f"The coefficients of the operator change between neighbours by more than their Taylor terms tell, at "
+            f"{len(bad)} particle(s), first {some(bad)}: they are steeper than the cloud resolves; refine it there."
+        )
+
+
+def _jumps(run: Any, values: np.ndarray, nums: Any, out: list[str], found: dict[str, float]) -> None:
+    if np.shape(nums.jac)[-1] == 1:
+        return
+    bad = np.flatnonzero(unseen(run.disc, nums, run.problem))
+    found["jumps"] = len(bad)
+    if len(bad):
+        out.append(
+            f"A coefficient of the highest derivatives jumps between neighbours, which its slopes do not tell, at "
+            f"{len(bad)} particle(s), first {some(bad)}: what happens there is lost; refine until the cloud resolves it, "
+            "or smooth it."
+        )
+
+
 def _weakness(run: Any, values: np.ndarray, nums: Any, out: list[str], found: dict[str, float]) -> None:
     if run.rows is None:
         return
@@ -210,9 +263,8 @@ def _weakness(run: Any, values: np.ndarray, nums: Any, out: list[str], found: di
 def _misfit(run: Any, values: np.ndarray, nums: Any, out: list[str], found: dict[str, float]) -> None:
     if run.misfit is None:
         return
-    spread = float(np.ptp(values)) or 1.0
     cells = len(values) ** (1.0 / run.disc.rec.dim)
-    found["misfit"] = float(np.sqrt(np.mean((run.misfit / spread) ** 2)) * cells)  # no square overflows
+    found["misfit"] = float(np.sqrt(np.mean((run.misfit / scales(values).max()) ** 2)) * cells)  # no square overflows
     if found["misfit"] > MISFIT:
         out.append(
             f"No function fits the equation and the conditions on this cloud: the misfit adds up to "

@@ -16,6 +16,7 @@ from jsmitsm.particle.polynomials import derivative_table, monomials
 from jsmitsm.runtime.errors import SolveError
 from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.solution.estimate import error_estimate
+from jsmitsm.solution.flags import share
 from jsmitsm.solution.fit import Recipe
 
 # An estimated error above this part of the solution is a flag.
@@ -71,6 +72,7 @@ class Solution:
         self.stats: dict[str, Any] = stats
         self._report: Report | None = report
         self._found: list[str] | None = None  # what the report said
+        self._error: np.ndarray | None = None  # the estimate, once asked for
         self._share = 0.0  # estimated error over solution
 
     @property
@@ -186,11 +188,13 @@ class Solution:
         self.refuse_stacked()
         if self._fit is None:
             raise ValueError("error_estimate: this solution was pickled without its problem; ask before pickling")
-        error = error_estimate(self._fit, self._values)
-        if not is_traced(error, self._values):
-            size = np.abs(self.u).max(initial=0.0) or 1.0  # no square overflows
-            self._share = float(np.linalg.norm(error / size) / (np.linalg.norm(self.u / size) or 1.0))
-        return error
+        if self._error is None:
+            error = error_estimate(self._fit, self._values)
+            if is_traced(error, self._values):
+                return error
+            self._error = np.asarray(error)
+            self._share = share(self._error.reshape(np.shape(self._values)), np.asarray(self._values))
+        return self._error.copy()
 
     def _estimated(self) -> float:
         """The estimated error over the solution, infinite where there is none."""
@@ -261,7 +265,7 @@ class Solution:
         new._values, new.cloud, new._fit, new._fitted, new.converged, new.iterations = leaves
         new._recipe = recipe
         new.stats = {}
-        new._report, new._found, new._share = None, None, 0.0
+        new._report, new._found, new._error, new._share = None, None, None, 0.0
         return new
 
     def __getstate__(self):

@@ -1,0 +1,83 @@
+"""The residual that the local polynomials leave between the particles, where nothing made it small."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from jsmitsm.discretization.coefficients import Numbers
+from jsmitsm.discretization.layout import Class, Discretization
+from jsmitsm.discretization.leave_one_out import right_side
+from jsmitsm.discretization.rows import all_coefficients, all_rows
+from jsmitsm.equation.problem import Problem
+from jsmitsm.particle.polynomials import derivative_table
+from jsmitsm.taylor.multi_indices import multi_indices
+
+
+def between(disc: Discretization, nums: Numbers, problem: Problem, values: Any, rows: Any, factor: Any) -> np.ndarray:
+    """What the residual between the particles makes of the solution, (N, F); nothing in the least-squares form.
+
+    rows: the classes and their rows, factor: that of the global system. The least-squares form has no rows, and its
+    estimate is another solution, which sees the same.
+    """
+    found = np.zeros(disc.held.size)
+    if rows is None or (disc.linear and disc.traced.constant and disc.traced.source != "variable"):
+        return found.reshape(disc.held.shape)
+    missed = unresolved(disc, nums, problem, values)
+    classes, made = rows
+    if not disc.scheme.sourced or disc.scheme.method in ("I", "II"):
+        # Rows of a problem without a source lack its weights; those of I and II hold the neighbours' sources.
+        disc = replace(disc, scheme=replace(disc.scheme, sourced=True))
+        disc.classes = [replace(cls, scheme=replace(cls.scheme, sourced=True)) for cls in classes]
+        classes, made = all_rows(disc, missed)
+    right = np.asarray(right_side(disc, missed, classes, made))
+    solved = factor.solve(np.concatenate([right, np.zeros(len(disc.floating))]))
+    found[~disc.held.reshape(-1)] = np.abs(solved[: len(right)])
+    return found.reshape(disc.held.shape)
+
+
+def unresolved(disc: Discretization, nums: Numbers, problem: Problem, values: Any) -> Numbers:
+    """The numbers of the same operator with, for its source, what the polynomials leave of the residual.
+
+    The residual is looked at halfway to the nearest 2 D neighbours, and averaged: a source or a coefficient that the
+    particles do not see, or whose Taylor series ends before it reaches the neighbours, shows there.
+    """
+    fitted = np.asarray(all_coefficients(disc, nums, values), float)
+    points, place = np.asarray(disc.points, float), np.full(len(disc.cloud), -1)
+    place[nums.ids] = np.arange(len(nums.ids))
+    source = np.zeros((disc.rec.n_rows, len(nums.ids)))
+    for cls in disc.classes:
+        source[np.array(disc.rec.equation_rows)[:, None], place[cls.ids]] = _mean(disc, problem, cls, points, fitted)
+    zero = np.zeros_like
+    return replace(nums, source=source, held=zero(nums.held), given=zero(nums.given), gamma=zero(nums.gamma))
+
+
+def _mean(disc: Discretization, problem: Problem, cls: Class, points: np.ndarray, fitted: np.ndarray) -> np.ndarray:
+    """The mean residual (E, n) around every particle of a class, whose own share of it is zero."""
+    near = np.asarray(cls.neighbours)[:, 1 : 1 + 2 * disc.rec.dim]
+    total, count = np.zeros((len(disc.rec.degrees), len(cls.ids))), np.ones(len(cls.ids))
+    for k in range(near.shape[1]):
+        there = near[:, k] >= 0
+        offset = 0.5 * (points[np.where(there, near[:, k], cls.ids)] - points[cls.ids])
+        found = _residual(disc, problem, points[cls.ids] + offset, offset, fitted[cls.ids])
+        total += np.where(there, found, 0.0)
+        count += there
+    return total / count
+
+
+def _residual(disc: Discretization, problem: Problem, at: np.ndarray, offset: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """The residual (E, n) of polynomials u (n, F, K) at their centres plus ``offset``."""
+    rec, traced = disc.rec, disc.traced
+    powers = np.stack([np.prod(offset ** np.array(a), axis=1) for a in multi_indices(rec.dim, rec.order)], axis=1)
+    slots = []
+    for f, b in traced.slots:
+        lower, factor = derivative_table(rec.dim, rec.order, b)
+        slots.append(np.einsum("nk,nk->n", u[:, f], powers[:, lower] * factor))
+    value = np.stack(slots)[:, None]
+    if not traced.linear:
+        return np.asarray(traced.coefficients(at, 0, params=problem.params, slots=value)[1])[:, 0]
+    jac, source = traced.coefficients(at, 0, params=problem.params)
+    found = np.einsum("esn,sn->en", np.broadcast_to(np.asarray(jac)[:, :, 0], (*jac.shape[:2], len(at))), value[:, 0])
+    return found if source is None else found + np.asarray(source)[:, 0]

@@ -1,0 +1,78 @@
+"""Whether the cloud resolves the operator's coefficients: what neighbours know of each other's."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from jsmitsm.discretization.coefficients import Numbers
+from jsmitsm.discretization.layout import Discretization
+from jsmitsm.equation.problem import Problem
+from jsmitsm.taylor.multi_indices import multi_indices
+
+# A coefficient that changes between neighbours by this part of the larger value jumps.
+JUMP = 0.5
+
+
+def steepness(disc: Discretization, nums: Numbers) -> np.ndarray:
+    """By how much the coefficients at the nearest neighbours differ from the particles' Taylor polynomials, (N,).
+
+    Each counts as it enters the recursion, scaled by the distance, in parts of the largest. Of degree 0 the
+    polynomials are constants.
+    """
+    rec, jac = disc.rec, np.asarray(nums.jac, float)
+    power = np.array([[rec.levels[e] - sum(b) - rec.weights[f] for f, b in rec.slots] for e in range(len(rec.levels))])
+    worst = np.zeros(len(disc.cloud))
+    for ids, here, there, offset in _pairs(disc, nums):
+        length = np.linalg.norm(offset, axis=1) ** power[..., None]
+        t = np.stack([np.prod(offset ** np.array(a), axis=1) for a in multi_indices(rec.dim, rec.degree)])
+        away = np.abs(np.einsum("estn,tn->esn", jac[..., here], t) - jac[:, :, 0, there]) * length
+        size = (np.maximum(np.abs(jac[:, :, 0, there]), np.abs(jac[:, :, 0, here])) * length).max(axis=1)
+        part = (away.max(axis=1) / np.where(size > 0, size, 1.0)).max(axis=0)
+        worst[ids] = np.maximum(worst[ids], part)
+    return worst
+
+
+def unseen(disc: Discretization, nums: Numbers, problem: Problem) -> np.ndarray:
+    """Which particles (N,) have a neighbour to which a leading coefficient jumps, and both their slopes say it does not.
+
+    The recursion knows a coefficient by its derivatives at the particles: of such a jump it knows nothing, nor do the
+    rows of a higher order, and the solution is that of another problem.
+    """
+    rec, jac = disc.rec, np.asarray(nums.jac, float)
+    found = np.zeros(len(disc.cloud), bool)
+    leading = [s for s, (f, b) in enumerate(rec.slots) if sum(b) + rec.weights[f] == max(rec.levels)]
+    pairs = []
+    for ids, here, there, offset in _pairs(disc, nums):
+        a, b = jac[:, leading, 0][..., here], jac[:, leading, 0][..., there]
+        largest = np.maximum(np.abs(a), np.abs(b)).max(axis=1, keepdims=True)
+        jumps = (np.abs(a - b) > JUMP * largest) & (largest > 0)
+        if jumps.any():
+            pairs.append((ids, here, there, offset, jumps))
+    if not pairs:
+        return found
+    if rec.degree == 0:
+        if not disc.linear:
+            return found
+        jac = np.asarray(disc.traced.coefficients(np.asarray(disc.cloud.points)[nums.ids], 1, params=problem.params)[0])
+    slopes = jac[:, leading, 1 : 1 + rec.dim]
+    for ids, here, there, offset, jumps in pairs:
+        change = jac[:, leading, 0][..., there] - jac[:, leading, 0][..., here]
+        told = 0.5 * np.einsum("esdn,nd->esn", slopes[..., here] + slopes[..., there], offset)
+        found[ids] |= (jumps & ((change - told) * np.sign(change) > 0.6 * np.abs(change))).any(axis=(0, 1))
+    return found
+
+
+def _pairs(disc: Discretization, nums: Numbers) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
+    """Particles with equations and their nearest neighbours that have one: numbers, places in ``nums``, offsets."""
+    points, place = np.asarray(disc.points, float), np.full(len(disc.cloud), -1)
+    place[nums.ids] = np.arange(len(nums.ids))
+    for cls in disc.classes:
+        near: Any = np.asarray(cls.neighbours)
+        owners = np.asarray(disc.images.owners(near))
+        for k in range(1, min(1 + 2 * disc.rec.dim, near.shape[1])):
+            both = (near[:, k] >= 0) & (place[np.maximum(owners[:, k], 0)] >= 0)
+            ids, other = cls.ids[both], near[both, k]
+            yield ids, place[ids], place[owners[both, k]], points[other] - points[ids]
