@@ -9,15 +9,20 @@ import numpy as np
 
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.discretization.coefficients import Numbers, numbers
-from jsmitsm.discretization.layout import Discretization
+from jsmitsm.discretization.health import LEBESGUE
+from jsmitsm.discretization.layout import Class, Discretization
 from jsmitsm.discretization.leave_one_out import matrix, right_side, with_held
 from jsmitsm.discretization.rows import all_rows
+from jsmitsm.particle.moments import Row
 from jsmitsm.runtime.progress import bar
 from jsmitsm.runtime.tracers import concrete, is_traced
 from jsmitsm.solution.arguments import discretized
 from jsmitsm.solution.fit import Fit
 from jsmitsm.solution.run import Run
 from jsmitsm.taylor.multi_indices import HIGHEST, multi_indices
+
+# Ratios of weights are taken for outliers beyond this factor of their median.
+OUTLIER = 2.0
 
 
 @bar("error estimate")
@@ -41,15 +46,46 @@ def error_estimate(fit: Fit, values: Any) -> Any:
     defect = _per_value(high, *high_rows, high_nums, values)
     own = _per_value(low, classes, rows, nums, values)
     free = np.flatnonzero(~low.held.reshape(-1))
-    ratio = own[1].reshape(-1)[free] / defect[1].reshape(-1)[free]
-    xp = jnp if is_traced(ratio) else np
-    ratio = xp.where(xp.isfinite(ratio) & (ratio != 0), ratio, 1.0)
+    ratio = _one_scale(own[1] / defect[1], low)
+    trust = _trust(high, *high_rows)
+    rest = (ratio * trust * defect[0]).reshape(-1)[free]
     data, r, c = matrix(low, classes, rows)
-    x, _ = run.solved(data, r, c, ratio * defect[0].reshape(-1)[free], balanced=False)
+    x, _ = run.solved(data, r, c, rest, balanced=False)
     zero = np.zeros(low.held.size)
     error: Any = jnp.asarray(zero).at[free].set(x) if is_traced(x) else _put(zero, free, x)
     error = abs(error).reshape(low.held.shape)
     return error[:, 0] if low.rec.fields == 1 else error
+
+
+def _one_scale(ratio: Any, disc: Discretization) -> Any:
+    """The ratios (N, F) of the weights that the source has in the rows of the two orders, without outliers.
+
+    A row with a condition of its own hardly hangs on the source, whose weights may vanish there in one of the two.
+    """
+    xp = jnp if is_traced(ratio) else np
+    ratio = xp.where(xp.isfinite(ratio) & (ratio != 0), ratio, 1.0)
+    typical = xp.ones(ratio.shape)
+    for some in (disc.n_own == 0, disc.n_own > 0):
+        for f in range(ratio.shape[1]):
+            ids = np.flatnonzero(some & ~disc.held[:, f])
+            if len(ids):
+                typical = xp.where((np.isin(np.arange(len(ratio)), ids))[:, None] & (np.arange(ratio.shape[1]) == f),
+                                   xp.median(ratio[ids, f]), typical)  # fmt: skip
+    part = ratio / typical
+    return typical * xp.where(part > 0, xp.clip(part, 1.0 / OUTLIER, OUTLIER), 1.0)
+
+
+def _trust(disc: Discretization, classes: list[Class], rows: list[Row]) -> Any:
+    """How far the rows of the higher order are trusted, (N, 1): those of one-sided stencils amplify what they miss."""
+    traced = is_traced(rows)
+    xp = jnp if traced else np
+    ids = np.concatenate([cls.ids for cls in classes])
+    lebesgue = xp.concatenate([xp.asarray(row.lebesgue).max(axis=1) for row in rows])
+    part = xp.minimum(1.0, (LEBESGUE / xp.maximum(lebesgue, 1.0)) ** 2)
+    trust = xp.ones(len(disc.cloud))
+    if traced:
+        return trust.at[ids].set(part)[:, None]
+    return _put(trust, ids, part)[:, None]
 
 
 def _against_higher(fit: Fit, low: Discretization, values: Any) -> Any:
