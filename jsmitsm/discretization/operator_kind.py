@@ -72,6 +72,12 @@ def mean_spacing(disc: Discretization) -> float:
     return float((np.prod(np.ptp(points, axis=0)) / len(points)) ** (1.0 / disc.rec.dim))
 
 
+def usual_condition(disc: Discretization) -> float:
+    """Of the order of the condition of a regular system: n^(m/D) for an operator of order m."""
+    order = max(disc.rec.order - q for q in disc.rec.degrees)
+    return float(len(disc.cloud) ** (order / disc.rec.dim))
+
+
 def wave_number(disc: Discretization, nums: Numbers) -> float:
     """k of an operator such as laplacian(u) + k^2 u, the median over the particles; 0 where it has no waves."""
     rec = disc.rec

@@ -3,24 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
-from jsmitsm.linear import linsolve
+from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.taylor.multi_indices import HIGHEST
 
 # A solvable pure Neumann problem leaves a mean residual below this part of its data,
 COMPATIBLE = 1e-6
 # or one that falls to less than this part of itself from one order to two orders higher.
 KEPT = 0.5
-# Between the fields of a system both vary more with the order: less than this is a doubt, not a refusal.
-UNSURE, FALLEN = 1e-3, 0.1
+# Between the fields of a system both vary more with the order: less than the second is a doubt, not a refusal. Less than
+# the first changes the solution by less than the discretisation does, and slopes taken at corners leave as much.
+UNSURE, FALLEN = (1e-5, 1e-3), 0.1
 
 
-def unbalanced(rest: float, imbalance_at: Callable[[int], float], order: int, fields: int) -> tuple[str, bool]:
+def unbalanced(
+    rest: float, imbalance_at: Callable[[int], float], order: int, fields: int, floating: tuple[int, ...]
+) -> tuple[str, bool]:
     """What speaks against data that leave the mean residual ``rest``, and whether that is certain; "" if nothing does.
 
-    imbalance_at: the mean residual of the same problem at another order.
+    imbalance_at: the mean residual of the same problem at another order; floating: the fields that nothing fixes.
     """
     if rest <= COMPATIBLE:
         return "", False
@@ -38,17 +43,19 @@ def unbalanced(rest: float, imbalance_at: Callable[[int], float], order: int, fi
         "correct the source or the fluxes, hold a value (js.dirichlet, js.fix), or refine a cloud that is too "
         "coarse for its data"
     )
-    if fields > 1 and min(rest, other) < UNSURE:
-        return f"The data may not balance, and nothing fixes the value {told}.", False
-    return f"the conditions are incompatible: nothing fixes the value, and the data do not balance {told}", True
+    names = f"field{'s' * (len(floating) > 1)} {', '.join(map(str, floating))}"
+    value = f"the value of {names}, which enters by its derivatives only" if fields > 1 else "the value"
+    if min(rest, other) < UNSURE[fields > 1]:
+        return f"The data may not balance, and nothing fixes {value} {told}." if fields > 1 else "", False
+    return f"the conditions are incompatible: nothing fixes {value}, and the data do not balance {told}", True
 
 
-def imbalance(system: linsolve.Factor, x: np.ndarray, b: np.ndarray, n: int) -> float:
+def imbalance(turned: Callable[[Any], Any], x: Any, b: Any, n: int) -> Any:
     """The largest Lagrange multiplier relative to the data that it sums up.
 
     With y the last row of the inverse, the multiplier is y . b, whatever the units of the equations that y weighs:
-    relative to |y| . |b| it is the same at every order, in a system of fields too.
+    relative to |y| . |b| it is the same at every order, in a system of fields too. ``turned`` solves with the transpose.
     """
-    weights = np.abs(system.solve(np.eye(len(b), len(b) - n, -n), transpose=True))
-    size = np.abs(b) @ weights
-    return float(np.max(np.abs(x[n:]) / np.where(size > 0, size, 1.0)))
+    xp = jnp if is_traced(x, b) else np
+    size = xp.abs(b) @ xp.abs(turned(np.eye(len(b), len(b) - n, -n)))
+    return xp.max(xp.abs(x[n:]) / xp.where(size > 0, size, 1.0))

@@ -31,12 +31,13 @@ def error_estimate(fit: Fit, values: Any) -> Any:
 
     The defect of the solution in rows of order p + 2, taken through the inverse of its own
     matrix: e = A_p^-1 D (b_{p+2} - A_{p+2} u_p). D brings the rows of the two orders to one scale,
-    that of the source in them. A least-squares solution is compared with that of order p + 2: its
-    rows have no common scale. Held values have no error; where p + 2 is no better than p (no
-    smoothness, or round-off) the estimate says little.
+    that of the source in them, and rows of one-sided stencils count less: they amplify what order p + 2 misses itself.
+    Solutions of other methods, whose rows are no such predictions, and of the least-squares form, whose rows have no
+    common scale, are compared with that of method S of order p + 2. Held values have no error; where p + 2 is no
+    better than p (no smoothness, or round-off) the estimate says little.
     """
     low = fit.discretization()
-    if fit.recipe.formulation == "lsq":
+    if fit.recipe.formulation == "lsq" or fit.recipe.method != "S":
         return _against_higher(fit, low, values)
     run = Run(low, fit.problem, "auto", True, False, "loo")
     nums = numbers(low, fit.problem, fit.taylor)
@@ -89,9 +90,10 @@ def _trust(disc: Discretization, classes: list[Class], rows: list[Row]) -> Any:
 
 
 def _against_higher(fit: Fit, low: Discretization, values: Any) -> Any:
-    """The distance to the least-squares solution of order p + 2, (N,) or (N, F)."""
+    """The distance to the solution by method S of order p + 2 in the same form, (N,) or (N, F)."""
     high, nums = _higher(fit, low)
-    run = Run(high, fit.problem, "auto", True, False, "lsq")
+    form = fit.recipe.formulation
+    run = Run(high, fit.problem, "auto", True, form == "loo", form)
     reference = with_held(high, nums, run.solved(*run.assembled(nums), balanced=False)[0])
     error = abs(reference - values)
     return error[:, 0] if low.rec.fields == 1 else error

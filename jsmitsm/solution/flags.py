@@ -16,7 +16,7 @@ import numpy as np
 
 from jsmitsm.discretization.health import LEBESGUE
 from jsmitsm.discretization.leave_one_out import right_side
-from jsmitsm.discretization.operator_kind import cell_peclet, mean_spacing, wave_number
+from jsmitsm.discretization.operator_kind import cell_peclet, mean_spacing, usual_condition, wave_number
 from jsmitsm.discretization.rows import all_rows
 from jsmitsm.runtime.errors import some
 from jsmitsm.solution.between import between
@@ -152,9 +152,7 @@ def predicted(points: np.ndarray, values: np.ndarray) -> np.ndarray:
 def _condition(run: Any, values: np.ndarray, nums: Any, out: list[str], found: dict[str, float]) -> None:
     if run.factor is None:
         return
-    rec = run.disc.rec
-    order = max(rec.order - q for q in rec.degrees)
-    usual = len(values) ** ((2 if run.formulation == "lsq" else 1) * order / rec.dim)
+    usual = usual_condition(run.disc) ** (2 if run.formulation == "lsq" else 1)
     found["excess"] = found["condition"] / usual
     if found["excess"] > SINGULAR[run.formulation]:
         out.append(

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from functools import cached_property
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -15,7 +16,7 @@ from jsmitsm.discretization.coefficients import Numbers, numbers
 from jsmitsm.discretization.layout import Class, Discretization, discretize
 from jsmitsm.discretization.least_squares import least_squares, misfit
 from jsmitsm.discretization.leave_one_out import matrix, right_side, with_held
-from jsmitsm.discretization.operator_kind import prefers_least_squares
+from jsmitsm.discretization.operator_kind import prefers_least_squares, usual_condition
 from jsmitsm.discretization.rows import all_rows
 from jsmitsm.equation.problem import Problem
 from jsmitsm.linear import linsolve
@@ -26,6 +27,11 @@ from jsmitsm.solution.balance import imbalance, unbalanced
 from jsmitsm.solution.flags import flags
 from jsmitsm.solution.memory import refuse_too_large
 from jsmitsm.solution.statistics import skipped
+
+
+# Under a JAX transform a system is taken for singular whose solution outgrows its right-hand side by so many times the
+# usual condition, and data for unbalanced that leave this part of them: there no other order is compared.
+GROWN, BALANCED = 1e4, 1e-2
 
 
 class Run:
@@ -119,7 +125,7 @@ class Run:
         values = with_held(self.disc, nums, x)
         self.seconds["solve"] += time.perf_counter() - start
         if is_traced(values):
-            return values, jnp.isfinite(values).all()
+            return values, jnp.isfinite(values).all() & good
         self.nums, self.values = nums, values
         return values, bool(good and np.isfinite(values).all() and not self.failed)
 
@@ -172,14 +178,29 @@ class Run:
                 particles,
             )
             return np.full(n, np.nan), False
-        if not is_traced(x):
-            x = np.asarray(x)
-            if disc.floating:
-                system = linsolve.factor(data, r, c, len(b), points, self.solver, self._elliptic)
-                self.imbalance = imbalance(system, x, b, n)
-                if balanced:
-                    self._check_balance()
+        if is_traced(x):
+            return x[:n], self._solvable(data, r, c, b, x, points) if balanced else True
+        x = np.asarray(x)
+        if disc.floating:
+            system = linsolve.factor(data, r, c, len(b), points, self.solver, self._elliptic)
+            self.imbalance = imbalance(lambda e: system.solve(e, transpose=True), x, b, n)
+            if balanced:
+                self._check_balance()
         return x[:n], True
+
+    def _solvable(self, data: Any, r: Any, c: Any, b: Any, x: Any, points: Any) -> Any:
+        """Under a JAX transform, where nothing raises: whether the system is regular and a floating field's data balance."""
+        n = int((~self.disc.held).sum())
+        largest = jnp.max(jnp.abs(b), initial=0.0)
+        good = jnp.max(jnp.abs(x), initial=0.0) <= GROWN * usual_condition(self.disc) * jnp.where(largest > 0, largest, 1.0)
+        if self.disc.floating:
+            data, b, x = jax.lax.stop_gradient((data, b, x))
+            turned = lambda e: jnp.stack([
+                linsolve.solve(data, c, r, column, n=len(b), points=points, solver=self.solver, elliptic=False)
+                for column in e.T
+            ], axis=1)  # fmt: skip
+            good &= imbalance(turned, x, b, n) <= BALANCED
+        return good
 
     @property
     def _elliptic(self) -> bool:
@@ -203,7 +224,9 @@ class Run:
     def _check_balance(self) -> None:
         """A field without values: its data must balance, up to what the discretisation explains."""
         self.messages.append("The conditions fix the solution only up to a constant; its mean over the particles is 0.")
-        told, certain = unbalanced(self.imbalance, self._imbalance_at, self.disc.rec.order, self.disc.rec.fields)
+        told, certain = unbalanced(
+            self.imbalance, self._imbalance_at, self.disc.rec.order, self.disc.rec.fields, self.disc.floating
+        )
         if certain:
             self.fail(told)
         elif told:

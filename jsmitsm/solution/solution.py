@@ -20,7 +20,7 @@ from jsmitsm.solution.flags import share
 from jsmitsm.solution.fit import Recipe
 
 # An estimated error above this part of the solution is a flag.
-LARGE = 0.1
+LARGE = 0.05
 
 
 class Report(Protocol):
