@@ -6,10 +6,12 @@ with a warning), or *silently wrong*, by the thresholds below, which were fixed 
 Writes benchmarks/data/stability.json after every sweep, and benchmarks/data/stability.png at the end;
 ``--quick`` runs a subset, names run single sweeps and replace their part of the data, and ``--resume``
 goes on where a run was broken off.
+
+``--random --seed N --cases M`` draws M cases instead (:mod:`benchmarks.random_cases`), prints the counts and writes
+benchmarks/data/random.json; ``--case K`` runs one of them. Some seconds a recipe of 40 cases, and a tenth of one a case.
 """
 
 import argparse
-import gc
 import itertools
 import json
 import subprocess
@@ -26,8 +28,9 @@ if "--float32" not in sys.argv:
 
 import jsmitsm as js
 from benchmarks import scenes
-from benchmarks.machine import describe
+from benchmarks.machine import describe, tidy
 from benchmarks.problems.families import FAMILIES, at_home
+from benchmarks.random_cases import sweep as random_sweep
 from jsmitsm.cloud.neighbours import Stencils
 
 DATA = Path(__file__).parent / "data" / "stability.json"
@@ -411,14 +414,6 @@ def run(sweep, quick, single):
     return records
 
 
-def tidy():
-    """Compiled programs hold memory maps, of which a process has a limited number."""
-    maps = Path("/proc/self/maps")
-    if maps.exists() and maps.read_bytes().count(b"\n") > 30000:
-        jax.clear_caches()
-        gc.collect()
-
-
 def run_single(sweep, quick):
     """The same in float32, which is a setting of the whole process."""
     command = [sys.executable, "-m", "benchmarks.stability", "--float32", sweep, *(["--quick"] if quick else [])]
@@ -550,13 +545,22 @@ def main():
     parser.add_argument("--quick", action="store_true", help="2D, order 4 alone")
     parser.add_argument("--resume", action="store_true", help="keep the sweeps that the output holds")
     parser.add_argument("--float32", action="store_true", help="run in float32 and print the records")
-    parser.add_argument("--output", default=str(DATA))
+    parser.add_argument("--output", default="", help="the file to write")
+    parser.add_argument("--random", action="store_true", help="random cases instead of the sweeps")
+    parser.add_argument("--seed", type=int, default=0, help="of the random cases")
+    parser.add_argument("--cases", type=int, default=4000, help="how many random cases")
+    parser.add_argument("--case", type=int, help="this random case alone")
+    parser.add_argument("--jobs", type=int, default=2, help="processes for the random cases")
+    parser.add_argument("--scratch", default=".cache/random", help="records as they come; a broken run goes on from them")
+    parser.add_argument("--part", type=int, help=argparse.SUPPRESS)
     args = parser.parse_args()
+    if args.random:
+        return random_sweep.main(args)
     names = args.names or list(SWEEPS)
     if args.float32:
         print(json.dumps([r for n in names for r in run(n, args.quick, True)]))
         return
-    path = Path(args.output)
+    path = Path(args.output or DATA)
     start = time.perf_counter()
     old = json.loads(path.read_text()) if (args.names or args.resume) and path.exists() else {"records": []}
     every, before = old["records"], old["seconds"] if args.resume and "seconds" in old else 0

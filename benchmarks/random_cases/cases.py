@@ -194,8 +194,8 @@ def case(seed: int, number: int) -> Case:
     if (made.operator, coefficient) == ("diffusion", "step") and rng.random() < 0.6:
         solution = "laminate"
     elif coefficient in ("waves", "step", "bump"):
-        # The source that a solution needs hides steps which the particles do not see: only laminates have narrower ones.
-        steep = max(steep, 1.2)
+        # The source that a solution needs makes up for steps which the particles do not see: only laminates have those.
+        steep = max(steep, 0.8 * domains.widest(cloud) / domains.spacing(cloud))
     start = "near" if made.dim == 3 or rng.random() < 0.7 else "none"
     return Case(
         seed, number, made.dim, made.operator, coefficient, solution, width, steep, made.domain, made.size, cloud_seed,

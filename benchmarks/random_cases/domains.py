@@ -7,6 +7,7 @@ from functools import lru_cache
 
 import jax.numpy as jnp
 import numpy as np
+from scipy.spatial import cKDTree
 
 import jsmitsm as js
 from benchmarks import scenes
@@ -116,3 +117,9 @@ def spacing(made: js.Cloud) -> float:
     """The edge of the cube that each particle has for itself."""
     points = np.asarray(made.points)
     return float((np.prod(np.ptp(points, axis=0)) / len(points)) ** (1.0 / made.dim))
+
+
+def widest(made: js.Cloud) -> float:
+    """The widest gap that a particle has on any side, about: to the farthest of its 2 D nearest neighbours."""
+    points = np.asarray(made.points)
+    return float(cKDTree(points).query(points, k=2 * made.dim + 1)[0].max())

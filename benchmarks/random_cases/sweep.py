@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.machine import describe
+from benchmarks.machine import describe, tidy
 from benchmarks.random_cases.cases import MEMBERS, case
 from benchmarks.random_cases.judging import BETWEEN, FLOOR, KINDS, RIGHT, WRONG, attempt, counts, effectivity, judged
 
@@ -32,8 +32,6 @@ def swept(seed: int, cases: int, jobs: int, scratch: Path) -> list[dict[str, Any
 
 def part(seed: int, cases: int, jobs: int, k: int, scratch: Path) -> None:
     """One process's share: every ``jobs``-th recipe, each record written when it is there."""
-    from benchmarks.stability import tidy
-
     done = {r["case"] for r in found(scratch, seed, cases)}
     with (scratch / f"seed{seed}-{k}of{jobs}.jsonl").open("a") as out:
         for number in range(cases):

@@ -15,8 +15,8 @@ from jsmitsm.taylor.multi_indices import HIGHEST
 COMPATIBLE = 1e-6
 # or one that falls to less than this part of itself from one order to two orders higher.
 KEPT = 0.5
-# Between the fields of a system both vary more with the order: less than the second is a doubt, not a refusal. Less than
-# the first changes the solution by less than the discretisation does, and slopes taken at corners leave as much.
+# Less than the first changes the solution by less than the discretisation does, and slopes taken at corners leave as
+# much. Between the fields of a system both vary more with the order: less than the second is a doubt, not a refusal.
 UNSURE, FALLEN = (1e-5, 1e-3), 0.1
 
 
@@ -54,7 +54,7 @@ def imbalance(turned: Callable[[Any], Any], x: Any, b: Any, n: int) -> Any:
     """The largest Lagrange multiplier relative to the data that it sums up.
 
     With y the last row of the inverse, the multiplier is y . b, whatever the units of the equations that y weighs:
-    relative to |y| . |b| it is the same at every order, in a system of fields too. ``turned`` solves with the transpose.
+    relative to |y| . |b| it is the same at every order, in a system of fields too. turned: solves with the transpose.
     """
     xp = jnp if is_traced(x, b) else np
     size = xp.abs(b) @ xp.abs(turned(np.eye(len(b), len(b) - n, -n)))

@@ -63,8 +63,8 @@ MANY = 200_000
 def flags(run: Any, values: Any, nums: Any, estimated: Callable[[], float]) -> tuple[list[str], dict[str, float]]:
     """Sentences, none for a healthy solution, and the measures behind them.
 
-    estimated: the estimated error as a part of the solution, asked for unless the cheap tests clear the solution, which they can do for linear problems of one field
-    in the leave-one-out form, or find what no estimate can excuse.
+    estimated: the estimated error as a part of the solution, asked for unless the cheap tests clear the solution, which
+    they can do for linear problems of one field in the leave-one-out form, or find what no estimate can excuse.
     """
     values = np.asarray(values, float)
     if not np.isfinite(values).all():
@@ -85,8 +85,8 @@ def flags(run: Any, values: Any, nums: Any, estimated: Callable[[], float]) -> t
     if missed <= MISSED:
         return [], found
     return [
-        f"Between the particles the equation is missed by as much as makes {missed:.0%} of the solution: the source or a "
-        "coefficient changes within the spacing, unseen by the particles; refine there, or smooth it."
+        f"Between the particles the equation is missed by as much as makes {missed:.0%} of the solution: the source or "
+        "a coefficient changes within the spacing, unseen by the particles; refine there, or smooth it."
     ], found
 
 
@@ -236,8 +236,8 @@ def _jumps(run: Any, values: np.ndarray, nums: Any, out: list[str], found: dict[
     if len(bad):
         out.append(
             f"A coefficient of the highest derivatives jumps between neighbours, which its slopes do not tell, at "
-            f"{len(bad)} particle(s), first {some(bad)}: what happens there is lost; refine until the cloud resolves it, "
-            "or smooth it."
+            f"{len(bad)} particle(s), first {some(bad)}: what happens there is lost; refine until the cloud resolves "
+            "it, or smooth it."
         )
 
 

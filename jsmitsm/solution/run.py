@@ -28,7 +28,6 @@ from jsmitsm.solution.flags import flags
 from jsmitsm.solution.memory import refuse_too_large
 from jsmitsm.solution.statistics import skipped
 
-
 # Under a JAX transform a system is taken for singular whose solution outgrows its right-hand side by so many times the
 # usual condition, and data for unbalanced that leave this part of them: there no other order is compared.
 GROWN, BALANCED = 1e4, 1e-2
@@ -189,10 +188,11 @@ class Run:
         return x[:n], True
 
     def _solvable(self, data: Any, r: Any, c: Any, b: Any, x: Any, points: Any) -> Any:
-        """Under a JAX transform, where nothing raises: whether the system is regular and a floating field's data balance."""
+        """Under a JAX transform, where nothing raises: whether the system is regular, and floating data balance."""
         n = int((~self.disc.held).sum())
         largest = jnp.max(jnp.abs(b), initial=0.0)
-        good = jnp.max(jnp.abs(x), initial=0.0) <= GROWN * usual_condition(self.disc) * jnp.where(largest > 0, largest, 1.0)
+        most = GROWN * usual_condition(self.disc) * jnp.where(largest > 0, largest, 1.0)
+        good = jnp.max(jnp.abs(x), initial=0.0) <= most
         if self.disc.floating:
             data, b, x = jax.lax.stop_gradient((data, b, x))
             turned = lambda e: jnp.stack([

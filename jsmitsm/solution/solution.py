@@ -16,8 +16,8 @@ from jsmitsm.particle.polynomials import derivative_table, monomials
 from jsmitsm.runtime.errors import SolveError
 from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.solution.estimate import error_estimate
-from jsmitsm.solution.flags import share
 from jsmitsm.solution.fit import Recipe
+from jsmitsm.solution.flags import share
 
 # An estimated error above this part of the solution is a flag.
 LARGE = 0.05

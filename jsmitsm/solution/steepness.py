@@ -36,7 +36,7 @@ def steepness(disc: Discretization, nums: Numbers) -> np.ndarray:
 
 
 def unseen(disc: Discretization, nums: Numbers, problem: Problem) -> np.ndarray:
-    """Which particles (N,) have a neighbour to which a leading coefficient jumps, and both their slopes say it does not.
+    """Which particles (N,) have a neighbour to which a leading coefficient jumps while both their slopes deny it.
 
     The recursion knows a coefficient by its derivatives at the particles: of such a jump it knows nothing, nor do the
     rows of a higher order, and the solution is that of another problem.
