@@ -90,10 +90,10 @@ def _trust(disc: Discretization, classes: list[Class], rows: list[Row]) -> Any:
 
 
 def _against_higher(fit: Fit, low: Discretization, values: Any) -> Any:
-    """The distance to the solution by method S of order p + 2 in the same form, (N,) or (N, F)."""
+    """The distance to the solution by method S of order p + 2, (N,) or (N, F)."""
     high, nums = _higher(fit, low)
-    form = fit.recipe.formulation
-    run = Run(high, fit.problem, "auto", True, form == "loo", form)
+    form = "lsq" if fit.recipe.formulation == "lsq" else "auto"
+    run = Run(high, fit.problem, "auto", True, form == "auto", form)
     reference = with_held(high, nums, run.solved(*run.assembled(nums), balanced=False)[0])
     error = abs(reference - values)
     return error[:, 0] if low.rec.fields == 1 else error

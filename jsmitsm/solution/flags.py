@@ -1,9 +1,10 @@
 """What a finished solve says against itself: cheap tests, and a sentence for each that fails.
 
 None of the tests costs a moment system: some solves with the kept factors and sums over neighbours.
-What they suspect of the resolution the error estimate may clear, which is made only then. A healthy
-solution has no flags. A flag is no proof of an error, nor its absence one of accuracy: the error
-estimate (:meth:`Solution.error_estimate`) sees more and costs more.
+They clear what is linear, of one field and far from their bounds. Everywhere else the error estimate
+(:meth:`Solution.error_estimate`) is asked, which costs another assembly of a higher order, and decides: it clears
+what was only suspected, and is a flag itself where it is large. A healthy solution has no flags. A flag is no proof of
+an error, nor its absence one of accuracy.
 """
 
 from __future__ import annotations
@@ -34,7 +35,8 @@ SOURCE = 0.3
 WEAK, FEW = 10.0, 0.01
 # Least squares: misfit of the local fits, added up across the domain, in parts of the range.
 # Measured: below 5e-4 where the solution is resolved, above 0.06 where a layer is not.
-MISFIT = 0.01
+# Beyond the second the estimate is no judge of it: no order sees a layer within the spacing.
+MISFIT, HOPELESS_MISFIT = 0.01, 0.1
 # Convection over diffusion between neighbours from which methods I and II lose the solution.
 PECLET = 1.0
 # Round-off of the moment systems times the condition: this leaves two digits.
@@ -76,7 +78,9 @@ def flags(run: Any, values: Any, nums: Any, estimated: Callable[[], float]) -> t
         test(run, values, nums, certain, found)
     for test in (_condition, _misfit, _waves, _roughness, _source, _coefficients, _weakness, _peclet):
         test(run, values, nums, doubts, found)
-    if certain or len(run.disc.cloud) > MANY or _cleared(run, found, doubts):
+    if certain or found.get("misfit", 0.0) > HOPELESS_MISFIT:
+        return doubts + certain, found
+    if len(run.disc.cloud) > MANY or _cleared(run, found, doubts):
         return doubts + certain, found
     found["estimate"] = estimated()
     if found["estimate"] > CLEARED:

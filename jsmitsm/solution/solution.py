@@ -74,6 +74,7 @@ class Solution:
         self._found: list[str] | None = None  # what the report said
         self._error: np.ndarray | None = None  # the estimate, once asked for
         self._share = 0.0  # estimated error over solution
+        self._untold = ""  # why there is no estimate, where flags asked in vain
 
     @property
     def method(self) -> str:
@@ -200,7 +201,8 @@ class Solution:
         """The estimated error over the solution, infinite where there is none."""
         try:
             self.error_estimate()
-        except (ValueError, SolveError):
+        except (ValueError, SolveError) as fault:
+            self._untold = f"There is no error estimate: {fault}."
             return np.inf
         return self._share if np.isfinite(self._share) else np.inf
 
@@ -209,9 +211,9 @@ class Solution:
         """What speaks against this solution, a sentence each; none for a healthy one.
 
         Tested when first asked for: roughness between neighbours, near singularity, an unresolved
-        source, hopeless stencils, misfits of the equation. Where only the resolution is in doubt, an
-        error estimate below 1 % clears it and one above 10 % confirms it (scalar linear problems of
-        up to 200,000 particles). An error estimate asked for before counts as well. No flag is no proof.
+        source or coefficient, hopeless stencils, misfits of the equation. Linear problems of one field that pass
+        by far are cleared. For all others, of up to 200,000 particles, the error is estimated: below 3 % clears what
+        is only suspected, above 5 % is a flag. No flag is no proof.
         """
         self.refuse_stacked()
         if self._found is None and self._report is not None:
@@ -245,6 +247,10 @@ class Solution:
         told = s.get("messages", [])
         lines += [f"FLAG: {line}" for line in self.flags if line not in told]
         lines += [str(line) for line in told]
+        if self._error is not None:
+            lines.append(f"The estimated error is {self._share:.1e} of the solution.")
+        elif self._untold:
+            lines.append(self._untold)
         if "lebesgue_max" in s:
             lines.append(f"Largest Lebesgue constant {s['lebesgue_max']:.3g} (up to 1.5 is healthy).")
         if "residual" in s:
@@ -265,7 +271,7 @@ class Solution:
         new._values, new.cloud, new._fit, new._fitted, new.converged, new.iterations = leaves
         new._recipe = recipe
         new.stats = {}
-        new._report, new._found, new._error, new._share = None, None, None, 0.0
+        new._report, new._found, new._error, new._share, new._untold = None, None, None, 0.0, ""
         return new
 
     def __getstate__(self):
