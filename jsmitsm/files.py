@@ -7,7 +7,6 @@ and shapely, ``pip install "jsmitsm[tables]"`` for pandas and xarray. CSV needs 
 from __future__ import annotations
 
 import csv
-import importlib
 import os
 from collections.abc import Mapping
 from typing import Any
@@ -15,7 +14,9 @@ from typing import Any
 import numpy as np
 
 from jsmitsm.clouds import INTERIOR, Cloud
-from jsmitsm.facets import boundary_normals, check_cells, named_facets, outer_facets, side_normals, volume_cells
+from jsmitsm.errors import refuse_masked
+from jsmitsm.meshes import cloud_of
+from jsmitsm.meshread import needed, read_mesh
 from jsmitsm.shapes import from_polygon
 from jsmitsm.simplices import simplices
 from jsmitsm.solution import Solution
@@ -59,97 +60,19 @@ def from_mesh(mesh: Any, tags: str | None = None) -> Cloud:
     Cloud(5 particles in 2D, groups {interior: 1, bottom: 2, side: 1, boundary: 1})
     """
     if isinstance(mesh, (str, os.PathLike)):
-        mesh = _read(mesh)
+        mesh = read_mesh(mesh)
     if not (hasattr(mesh, "points") and hasattr(mesh, "cells")):
         raise ValueError(f"mesh: expected a meshio.Mesh or the path of a mesh file, got {type(mesh).__name__}")
-    dim, cells = volume_cells(mesh.cells)
-    points = _checked_nodes(mesh.points, dim)
-    check_cells(len(points), cells)
-    size = np.ptp(points, axis=0).max()
-    if points.shape[1] > dim and np.ptp(points[:, dim:], axis=0).max() > 1e-12 * size:
-        raise ValueError(
-            f"mesh: its cells are {dim}-dimensional but its points are not in the first {dim} axes; "
-            "a surface in space is no domain, mesh the volume"
-        )
-    used = np.unique(np.concatenate([block.ravel() for _, block in cells]))
-    new = np.full(len(points), -1)
-    new[used] = np.arange(len(used))
-    points = np.ascontiguousarray(points[used, :dim])
-    # Products of coordinates must neither overflow nor vanish: the geometry is found in units of its size.
-    unit = float(np.ptp(points, axis=0).max()) or 1.0
-    corner = points.min(axis=0)
-    cells = [(kind, new[block]) for kind, block in cells]
-    scaled = (points - corner) / unit
-    outer = outer_facets(scaled, cells)
-    normals = boundary_normals(scaled, outer)
-    free = np.isfinite(normals[:, 0])
-    groups = {INTERIOR: np.flatnonzero(~free)}
-    for name, nodes in named_facets(mesh, dim, tags).items():
-        nodes = new[nodes]
-        nodes = np.unique(nodes[nodes >= 0])
-        claimed = nodes[free[nodes]]  # tags inside of the domain are no boundary
-        if len(claimed):
-            if name == INTERIOR:
-                raise ValueError(f"mesh: boundary facets are tagged {INTERIOR!r}, the name of what lies inside; rename")
-            groups[name] = claimed
-            free[claimed] = False
-            members = np.zeros(len(points), bool)
-            members[nodes] = True
-            # At a corner between groups the normal is that of the own side: what is said of a side holds to its end.
-            own = side_normals(scaled, outer, members)[claimed]
-            normals[claimed] = np.where(np.isfinite(own), own, normals[claimed])
-    if free.any():
-        groups["boundary"] = np.union1d(groups.get("boundary", np.zeros(0, int)), np.flatnonzero(free))
-    return Cloud(points, groups, normals)
+    return cloud_of(mesh, *_tag_key(tags))
 
 
-def _checked_nodes(points: Any, dim: int) -> np.ndarray:
-    """The nodes of a mesh (N, D), real and finite, in at least as many axes as its cells have."""
-    array = np.asarray(points)
-    if array.dtype.kind not in "iuf" or array.ndim != 2 or array.shape[1] < dim:
-        raise ValueError(
-            f"mesh: its points have shape {array.shape} and type {array.dtype}; expected real numbers (N, D), D at "
-            f"least {dim} for its cells"
-        )
-    bad = np.flatnonzero(~np.isfinite(array).all(axis=1))
-    if len(bad):
-        raise ValueError(f"mesh: NaN or infinite coordinates at the points {bad[:5].tolist()}; remove or mend them")
-    return array.astype(np.float64)
-
-
-def _read(path: Any) -> Any:
-    """The mesh in a file; whatever meshio does with one that is damaged, which may be to end the program."""
-    meshio = _needed("meshio", "mesh")
-    if not os.path.isfile(path):
-        raise ValueError(f"mesh: there is no file {os.fspath(path)!r}; give the path of a mesh file")
-    with open(path, "rb") as file:
-        start = file.read(1)
-        file.seek(-min(os.path.getsize(path), 100), os.SEEK_END)
-        end = file.read().split()
-        if os.fspath(path).endswith((".node", ".ele")):  # comments alone are nothing either
-            file.seek(0)
-            end = [line for line in file if not line.strip().startswith(b"#") and line.strip()]
-    kind = {b"$": "gmsh", b"(": "ansys"}.get(start) if os.fspath(path).endswith(".msh") else None
-    # Of such a file that ends too soon, or is of neither kind, meshio would look for the end for ever.
-    whole = end and (end[-1].startswith(b"$End") if kind == "gmsh" else end[-1].endswith(b")") or kind != "ansys")
-    if not whole:
-        raise ValueError(f"mesh: the file {os.fspath(path)!r} is {'cut short' if end else 'empty'}; write it again")
-    if kind is None and os.fspath(path).endswith(".msh"):
-        raise ValueError(
-            f"mesh: the file {os.fspath(path)!r} is of neither kind of .msh, Gmsh's or Ansys's; convert it"
-        )
-    try:
-        return meshio.read(path, kind)
-    except ModuleNotFoundError as error:
-        raise ImportError(
-            f"mesh: meshio needs {error.name} for {os.fspath(path)!r}: pip install {error.name}"
-        ) from None
-    except (Exception, SystemExit) as error:
-        what = f"{type(error).__name__}: {error}".strip(": ")
-        raise ValueError(
-            f"mesh: meshio cannot read {os.fspath(path)!r} ({what}); expected a whole file of a format that its "
-            "extension names (.msh, .vtk, .vtu, .inp, .xdmf, ...)"
-        ) from error
+def _tag_key(tags: Any) -> tuple[str | None, list[str] | None]:
+    """The cell data that hold the groups, or the groups themselves."""
+    if tags is None or isinstance(tags, str):
+        return tags, None
+    if isinstance(tags, (list, tuple)) and tags and all(isinstance(name, str) for name in tags):
+        return None, list(tags)
+    raise ValueError(f"tags: expected the name of cell data, or a list of the names of groups, got {tags!r}")
 
 
 def from_shapely(polygon: Any, spacing: Any, seed: int = 0, groups: Any = None) -> Cloud:
@@ -164,7 +87,7 @@ def from_shapely(polygon: Any, spacing: Any, seed: int = 0, groups: Any = None) 
     ['boundary', 'hole0', 'interior']
     """
     if isinstance(polygon, str):
-        shapely, text = _needed("shapely", "mesh"), polygon
+        shapely, text = needed("shapely", "mesh"), polygon
         try:
             polygon = shapely.from_wkt(text)
         except shapely.errors.ShapelyError as error:
@@ -193,24 +116,42 @@ def from_csv(path: Any) -> Cloud:
     Cloud(3 particles in 1D, groups {interior: 1, left: 1, right: 1})
     """
     try:
-        with open(path, newline="", encoding="utf-8-sig") as file:
-            rows = list(csv.DictReader(file, skipinitialspace=True))
-    except (OSError, TypeError) as error:
+        with open(_a_path(path), newline="", encoding="utf-8-sig") as file:
+            reader = csv.reader(file, skipinitialspace=True, strict=True)
+            lines = [(reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]
+    except OSError as error:
         raise ValueError(f"path: cannot read {path!r} ({error}); give the path of a CSV file") from None
     except (UnicodeDecodeError, csv.Error) as error:
         raise ValueError(f"path: {path} is no text in UTF-8 ({error}); save it as CSV in UTF-8") from None
-    if not rows:
+    if len(lines) < 2:
         raise ValueError(f"path: {path} has no rows below its header")
-    axes = [name for name in _AXES if name in rows[0]]
-    if "group" not in rows[0] or "".join(axes) not in ("x", "xy", "xyz"):
-        raise ValueError(f"path: {path} has the columns {list(rows[0])}; expected x (and y, z) and group")
-    points = _numbers(rows, axes, path)
-    names = [(row["group"] or "").strip() for row in rows]
-    if "" in names:
-        raise ValueError(f"path: {path}, line {names.index('') + 2}: has no group; expected {INTERIOR} or a name")
-    groups = {name: np.flatnonzero([n == name for n in names]) for name in dict.fromkeys([INTERIOR, *names])}
+    header = [name.strip() for name in lines[0][1]]
+    axes = [name for name in _AXES if name in header]
     normals = [f"n{name}" for name in axes]
-    return Cloud(points, groups, _numbers(rows, normals, path) if normals[0] in rows[0] else None)
+    if "group" not in header or "".join(axes) not in ("x", "xy", "xyz"):
+        raise ValueError(f"path: {path} has the columns {header}; expected x (and y, z) and group")
+    twice = [name for name in dict.fromkeys(header) if header.count(name) > 1 and name in (*axes, *normals, "group")]
+    if twice:
+        raise ValueError(f"path: {path} has several columns of the name {twice[0]!r}; keep one")
+    if 0 < sum(name in header for name in normals) < len(axes):
+        raise ValueError(f"path: {path} has the columns {header}; expected all of {normals} for normals, or none")
+    for line, row in lines:
+        if any(cell.strip() for cell in row[len(header) :]):
+            raise ValueError(
+                f"path: {path}, line {line}: has {len(row)} cells under {len(header)} columns; write one under each, "
+                "numbers with a point"
+            )
+    rows = [(line, dict(zip(header, row))) for line, row in lines[1:]]
+    points = _numbers(rows, axes, path)
+    names = [row.get("group", "").strip() for _, row in rows]
+    for (line, _), name in zip(rows, names):
+        if not name or (name != INTERIOR and name.lower() == INTERIOR):
+            raise ValueError(
+                f"path: {path}, line {line}: has {f'the group {name!r}' if name else 'no group'}; expected {INTERIOR} or "
+                "the name of a side"
+            )
+    groups = {name: np.flatnonzero([n == name for n in names]) for name in dict.fromkeys([INTERIOR, *names])}
+    return Cloud(points, groups, _numbers(rows, normals, path) if normals[0] in header else None)
 
 
 def to_csv(what: Cloud | Solution, path: Any) -> None:
@@ -220,7 +161,10 @@ def to_csv(what: Cloud | Solution, path: Any) -> None:
     last bit, see :func:`from_csv`.
     """
     columns = _columns(_a_kind(what, (Cloud, Solution), "what"))
-    with open(path, "w", newline="", encoding="utf-8") as file:
+    for name in set(columns["group"]):
+        if name != name.strip() or not name or (name != INTERIOR and name.lower() == INTERIOR):
+            raise ValueError(f"what: the name {name!r} of a group would not read back from CSV; rename the group")
+    with open(_a_path(path), "w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(columns)
         for row in zip(*columns.values()):
@@ -241,7 +185,7 @@ def to_mesh(sol: Solution, **more: Any) -> Any:
     >>> js.files.to_mesh(sol).point_data["u"].shape
     (9,)
     """
-    meshio = _needed("meshio", "mesh")
+    meshio = needed("meshio", "mesh")
     cloud = _a_kind(sol, (Solution,), "sol").cloud
     points = np.zeros((len(cloud), 3))
     points[:, : cloud.dim] = cloud.points
@@ -260,7 +204,7 @@ def to_pandas(what: Cloud | Solution, **more: Any) -> Any:
     ['left', 'interior', 'right']
     """
     columns = _columns(_a_kind(what, (Cloud, Solution), "what"))
-    return _needed("pandas", "tables").DataFrame({**columns, **_per_particle(more, len(columns["x"]), (1,), columns)})
+    return needed("pandas", "tables").DataFrame({**columns, **_per_particle(more, len(columns["x"]), (1,), columns)})
 
 
 def to_xarray(sol: Solution, **more: Any) -> Any:
@@ -276,7 +220,7 @@ def to_xarray(sol: Solution, **more: Any) -> Any:
     >>> js.files.to_xarray(sol).u.sizes["particle"]
     9
     """
-    xarray = _needed("xarray", "tables")
+    xarray = needed("xarray", "tables")
     columns = _columns(_a_kind(sol, (Solution,), "sol").cloud)
     more = _per_particle(more, len(sol.cloud), (1,), columns)
     dims = ("particle", "field")[: np.ndim(sol.u)]
@@ -285,14 +229,6 @@ def to_xarray(sol: Solution, **more: Any) -> Any:
         coords={name: ("particle", column) for name, column in columns.items()},
         attrs={"method": sol.method, "order": sol.order, "converged": int(bool(sol.converged))},
     )
-
-
-def _needed(name: str, extra: str) -> Any:
-    """An optional library, or an error that names its extra."""
-    try:
-        return importlib.import_module(name)
-    except ImportError:
-        raise ImportError(f'{name} is needed here, an optional extra: pip install "jsmitsm[{extra}]"') from None
 
 
 def _a_kind(what: Any, kinds: tuple[type, ...], name: str) -> Any:
@@ -309,10 +245,12 @@ def _per_particle(more: Mapping[str, Any], count: int, dims: tuple[int, ...], ta
     """Further columns as arrays with a row for every particle."""
     out = {}
     for name, value in more.items():
+        refuse_masked(value, name)
         array = np.asarray(value)
         if array.ndim not in dims or len(array) != count or array.dtype.kind == "O":
+            what = " of Python's objects (missing values?)" if array.dtype.kind == "O" and array.ndim else ""
             raise ValueError(
-                f"{name}: values of shape {array.shape} came, expected {count}, one per particle"
+                f"{name}: values of shape {array.shape} came{what}, expected {count}, one per particle"
                 + (", or rows of them" if 2 in dims else "")
             )
         if name in taken:
@@ -337,14 +275,23 @@ def _columns(what: Cloud | Solution) -> Mapping[str, np.ndarray]:
     return columns
 
 
-def _numbers(rows: list[dict[str, str]], names: list[str], path: Any) -> np.ndarray:
+def _numbers(rows: list[tuple[int, dict[str, str]]], names: list[str], path: Any) -> np.ndarray:
     """Columns of a table (N, len(names)); an empty cell is NaN."""
     table = np.empty((len(rows), len(names)))
-    for i, row in enumerate(rows):
+    for i, (line, row) in enumerate(rows):
         for k, name in enumerate(names):
-            cell = row.get(name)
+            cell = row.get(name, "").strip()
             try:
+                if "_" in cell:  # 1_000 is a number of Python's alone
+                    raise ValueError
                 table[i, k] = float(cell) if cell else np.nan
             except ValueError:
-                raise ValueError(f"path: {path}, line {i + 2}: {name} = {cell!r} is no number") from None
+                raise ValueError(f"path: {path}, line {line}: {name} = {cell!r} is no number") from None
     return table
+
+
+def _a_path(path: Any) -> Any:
+    """``path``, or an error: a number would be taken for an open file of the program's."""
+    if not isinstance(path, (str, bytes, os.PathLike)):
+        raise ValueError(f"path: cannot read {path!r}, a {type(path).__name__}; give the path of a CSV file")
+    return path

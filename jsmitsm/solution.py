@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm.clouds import Cloud
-from jsmitsm.errors import SolveError
+from jsmitsm.errors import SolveError, refuse_masked
 from jsmitsm.polynomials import derivative_table, monomials
 from jsmitsm.tracers import is_traced
 
@@ -285,6 +285,7 @@ class Solution:
 
 def _checked_points(points: Any, dim: int) -> Any:
     if not is_traced(points):
+        refuse_masked(points, "points")
         try:
             if np.iscomplexobj(points):
                 raise TypeError

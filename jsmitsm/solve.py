@@ -11,6 +11,7 @@ import numpy as np
 from jsmitsm import discretize as dz
 from jsmitsm.clouds import Cloud
 from jsmitsm.discretize import Discretization
+from jsmitsm.errors import refuse_masked
 from jsmitsm.kernels import Kernel
 from jsmitsm.linsolve import SOLVERS
 from jsmitsm.neighbours import Stencils
@@ -177,6 +178,7 @@ def _check_start(u0: Any, shape: tuple[int, int]) -> None:
     """A start for Newton's method: nothing, a function, or finite values of the right shape."""
     if u0 is None or callable(u0) or is_traced(u0):
         return
+    refuse_masked(u0, "u0")
     try:
         if np.iscomplexobj(u0):
             raise TypeError
