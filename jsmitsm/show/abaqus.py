@@ -90,6 +90,8 @@ def _cards(path: str, depth: int = 0) -> Iterator[tuple[str, dict[str, str], lis
             rows.append([word.strip() for word in lines[k].split(",")])
             k += 1
         card = words[0].upper()
+        if not re.fullmatch(r"[A-Z][A-Z0-9 _-]*", card):
+            raise ValueError(f"the line {head[:60]!r} has no keyword; expected one, as *NODE, and options after commas")
         if card == "INCLUDE":
             if depth > 8:
                 raise ValueError(f"the file {path!r} is included by itself")
@@ -166,13 +168,16 @@ def _mesh(deck: _Deck) -> Mesh:
     points = {}
     for (kind, upper), members in deck.sets.items():
         name = deck.names[kind, upper]
+        lost = [n for n in members if n not in (place if kind == "NSET" else row)]
+        if lost:
+            what = "node" if kind == "NSET" else "element"
+            raise ValueError(f"the set {name!r} has {what} {lost[0]}, which does not come")
         if kind == "NSET":
-            points[name] = np.array([place[n] for n in members if n in place], int)
+            points[name] = np.array([place[n] for n in members], int)
             continue
         sets[name] = [[] for _ in cells]
         for e in members:
-            if e in row:
-                sets[name][row[e][0]].append(row[e][1])
+            sets[name][row[e][0]].append(row[e][1])
     for name, faces in deck.surfaces.items():
         for block in _faces(deck, place, faces):
             for lists in sets.values():

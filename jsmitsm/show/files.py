@@ -33,24 +33,32 @@ def from_mesh(mesh: Any, tags: str | None = None) -> Cloud:
 
     Parameters
     ----------
-    mesh : a ``meshio.Mesh``, or the path of a file that meshio reads (Gmsh, VTK, Abaqus, XDMF, ...). Lines,
-        triangles and quadrilaterals, tetrahedra, hexahedra, wedges and pyramids, triangles and tetrahedra also of
-        second order. The cells of the highest dimension are the domain; nodes that none of them uses are dropped.
+    mesh : a ``meshio.Mesh``, or the path of a file: SU2 and Abaqus or CalculiX (.inp), what meshio reads besides
+        (Gmsh, VTK, XDMF, ...). Lines, triangles, quadrilaterals, tetrahedra, hexahedra, wedges and pyramids, of
+        first and of second order. The cells of the highest dimension are the domain; nodes that none of them uses are
+        dropped.
     tags : the name of the cell data that hold the groups; found by itself for Gmsh (``gmsh:physical``, names
-        from its physical groups), Medit and others, whose groups are cell sets or point sets.
+        from its physical groups), Medit and others, whose groups are cell sets or point sets. Or a list of the names
+        of groups: those alone, the first first.
 
     Returns
     -------
-    Cloud : groups ``"interior"`` and one for every tag of boundary facets. A node on two of them belongs to the one
-        named first, a boundary node on none to ``"boundary"``. Normals are those of the group's facets, averaged by
-        angle: on curved sides as exact as the facets follow them; ``cloud.replace(normals=...)`` takes better ones.
+    Cloud : groups ``"interior"`` and one for every tag of boundary facets and every set of boundary nodes. A node of
+        several belongs to the one named first, but a set that holds another whole comes after it, and none goes away
+        empty-handed; a boundary node of none belongs to ``"boundary"``. Normals are those of the group's
+        facets, averaged by angle: on curved sides as exact as the facets follow them (those of second order are
+        parabolas); ``cloud.replace(normals=...)`` takes better ones. What has a name and is no side (materials, lines
+        inside, sets that reach inside) is in ``cloud.cell_groups``: indices by name, which may overlap.
 
     Raises
     ------
     ImportError
         Where a path is given and meshio is missing: ``pip install "jsmitsm[mesh]"``.
     ValueError
-        For a mesh without cells, a surface in space, an unknown kind of cell, or tags that do not exist.
+        For a mesh without cells, a surface in space, parts of several dimensions, an unknown kind of cell; for cells
+        without volume, with crossing sides, folded or overlapping; for hanging nodes and nodes that were not merged;
+        for a domain that touches itself in a point or an edge; for a group without a node of its own, and tags that do
+        not exist or name nothing. Which way round the nodes of a cell run does not matter.
 
     >>> import meshio, numpy as np, jsmitsm as js
     >>> corners = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0.5, 0.5, 0]]
@@ -58,7 +66,7 @@ def from_mesh(mesh: Any, tags: str | None = None) -> Cloud:
     ...                              ("line", [[0, 1], [1, 2]])], cell_data={"gmsh:physical": [[7] * 4, [1, 2]]},
     ...                    field_data={"bottom": np.array([1, 1]), "side": np.array([2, 1])})
     >>> js.files.from_mesh(mesh)
-    Cloud(5 particles in 2D, groups {interior: 1, bottom: 2, side: 1, boundary: 1})
+    Cloud(5 particles in 2D, groups {interior: 1, bottom: 2, side: 1, boundary: 1}, cell groups {7: 5})
     """
     if isinstance(mesh, (str, os.PathLike)):
         mesh = read_mesh(mesh)
@@ -108,7 +116,8 @@ def from_csv(path: Any) -> Cloud:
     """A cloud from a CSV file with a header: columns ``x`` (``y``, ``z``) and ``group``; normals in ``nx`` (``ny``,
     ``nz``) where there are any, empty in the interior. Other columns are ignored. :func:`to_csv` writes such files.
 
-    Raises ValueError for a missing column or a cell that is no number, with its line. ``path``: a name or a path.
+    Raises ValueError for a column that is missing or comes twice, and a cell that is no number, with its line.
+    ``path``: a name or a path.
 
     >>> import os, tempfile, jsmitsm as js
     >>> path = os.path.join(tempfile.mkdtemp(), "cloud.csv")
@@ -159,7 +168,7 @@ def to_csv(what: Cloud | Solution, path: Any) -> None:
     """Write a cloud, or a solution with its cloud, as CSV: coordinates, group, normals and the values ``u``.
 
     ``what``: a cloud or a solution; ``path``: a name or a path. Numbers are written so that they read back to the
-    last bit, see :func:`from_csv`.
+    last bit, see :func:`from_csv`; cell groups are not written.
     """
     columns = _columns(_a_kind(what, (Cloud, Solution), "what"))
     for name in set(columns["group"]):

@@ -6,6 +6,7 @@ import contextlib
 import importlib
 import io
 import os
+import warnings
 from typing import Any
 
 from jsmitsm.show.abaqus import read_abaqus
@@ -35,7 +36,9 @@ def read_mesh(path: Any) -> Any:
     kind = _checked_kind(name, extension)
     said = io.StringIO()
     try:
-        with contextlib.redirect_stderr(said):
+        with contextlib.redirect_stderr(said), contextlib.redirect_stdout(said), warnings.catch_warnings():
+            # numpy stops at what is no number, and meshio goes on with what came before.
+            warnings.filterwarnings("error", message=".*could not be read to its end")
             mesh = _OWN[extension](name) if meshio is None else meshio.read(name, kind)
     except ModuleNotFoundError as error:
         raise ImportError(f"mesh: meshio needs {error.name} for {name!r}: pip install {error.name}") from None

@@ -17,7 +17,7 @@ def read_su2(path: str) -> Mesh:
     """The mesh of one zone; its markers are cell sets."""
     with open(path, encoding="utf-8", errors="replace") as file:
         lines = iter([text for line in file if (text := line.split("%")[0].strip())])
-    dim, points, marker = 0, None, None
+    dim, points, marker, wanted = 0, None, None, None
     blocks: list[Block] = []
     sets: dict[str, list[int]] = {}
     for line in lines:
@@ -31,6 +31,8 @@ def read_su2(path: str) -> Mesh:
             raise ValueError(f"{key}= {value}: one zone is read; write the zones into files of their own")
         elif key == "NPOIN":
             points = _points(lines, int(value.split()[0]), dim)
+        elif key == "NMARK":
+            wanted = int(value)
         elif key == "MARKER_TAG":
             marker = value
         elif key in ("NELEM", "MARKER_ELEMS"):
@@ -42,6 +44,8 @@ def read_su2(path: str) -> Mesh:
                 blocks.append(Block(kind, cells))
     if points is None or not blocks:
         raise ValueError("there are no points (NPOIN) or no cells (NELEM)")
+    if wanted is not None and wanted != len(sets):
+        raise ValueError(f"NMARK= {wanted}, but there are {len(sets)} markers {list(sets)}")
     members = {name: [np.arange(len(cells)) if k in own else np.zeros(0, int) for k, (_, cells) in enumerate(blocks)]
                for name, own in sets.items()}  # fmt: skip
     return Mesh(points, blocks, cell_sets=members)
