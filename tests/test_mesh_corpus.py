@@ -160,7 +160,9 @@ WRONG = {
         meshio.Mesh([*SQUARE, [1, 0.5], [0.5, 0], [0.5, 1], [0, 0.5], [2, 0], [2, 1], [2, 0.5]],
                     [("quad8", [[0, 1, 2, 3, 5, 4, 6, 7]]), ("quad", [[1, 8, 10, 4], [4, 10, 9, 2]])]),
         "a middle one is a corner of another cell: a hanging node"),
-    "nodes not merged": (parts(SQUARE, SQUARE + [1, 0]), r"the nodes \[1, 2, 4, 7\] lie on sides.*merge the nodes"),
+    "nodes not merged": (parts(SQUARE, SQUARE + [1, 0]), r"2 of its nodes stand where others do, as \[1, 4\]; merge"),
+    "nodes not quite merged": (parts(SQUARE, SQUARE + [1 + 1e-9, 0]), r"\[1, 2, 4, 7\] lie on sides.*merge the nodes"),
+    "a side not merged": (parts(SQUARE, SQUARE + [1, 0.5]), r"the nodes \[2, 4\] lie on sides.*merge the nodes"),
     "seam of a wrong diagonal": (
         meshio.Mesh(PYRAMID, [("hexahedron", [range(8)]), ("tetra", [[4, 5, 6, 8], [4, 6, 7, 8]])]),
         "facets lie on sides.*hanging nodes"),
@@ -226,6 +228,12 @@ def test_harmless_cells_are_read():
     assert len(from_mesh(parts(SQUARE, SQUARE + [1.01, 0]))) == 8
     rounded = np.pad(SQUARE, ((0, 0), (0, 1))) + 1e-10 * np.arange(12).reshape(4, 3)
     assert len(from_mesh(meshio.Mesh(rounded, [("triangle", HALVES)]))) == 4
+    x, y, z = np.meshgrid(*[np.linspace(0, 1, 5)] * 2, [0, 1e-5], indexing="ij")  # its sides are warped by more than that
+    shell = np.stack([x, y, z + 0.2 * np.sin(5 * x) * np.cos(4 * y)], axis=-1).reshape(-1, 3)
+    at = np.arange(50).reshape(5, 5, 2)
+    ring = [at[:-1, :-1], at[1:, :-1], at[1:, 1:], at[:-1, 1:]]
+    bricks = np.stack([corner[..., k].ravel() for k in (0, 1) for corner in ring], axis=1)
+    assert len(from_mesh(meshio.Mesh(shell, [("hexahedron", bricks)])).groups["boundary"]) == 50
     orphan = from_mesh(meshio.Mesh([*SQUARE, [0.5, 0.4]], [("triangle", HALVES), ("vertex", [[4]])]))
     assert len(orphan) == 4
 
@@ -346,6 +354,16 @@ def test_gmsh_2_with_a_tag_of_none(tmp_path):
     cloud = from_mesh(write(tmp_path, "a.MSH", text))
     assert names(cloud) == {"interior": [4], "wall": [0, 1, 2], "lid": [7, 8], "boundary": [3, 5, 6]}
     assert list(cloud.cell_groups) == ["fluid"]
+
+
+def test_gmsh_2_writes_a_cell_of_two_groups_twice(tmp_path):
+    """Once for each; the same again within one group is a fault."""
+    copies = [f"3 2 6 1 {' '.join(str(n + 1) for n in quad)}" for quad in QUADS[:2]]
+    cloud = from_mesh(write(tmp_path, "a.msh", msh2(["1 2 7 1 1 2", "1 2 8 1 1 2", "1 2 7 1 2 3", *copies])))
+    assert names(cloud) == {"interior": [4], "wall": [2], "lid": [0, 1], "boundary": [3, 5, 6, 7, 8]}
+    assert {k: len(v) for k, v in cloud.cell_groups.items()} == {"fluid": 9, "6": 6}
+    with pytest.raises(ValueError, match="mesh: .*belongs to 4 cells"):
+        from_mesh(write(tmp_path, "a.msh", msh2([*copies, *copies])))
 
 
 def test_gmsh_4_1(tmp_path):

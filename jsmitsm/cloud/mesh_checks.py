@@ -34,7 +34,7 @@ def domain_sides(points: np.ndarray, cells: list[Cells], asked: list[np.ndarray]
     sides = [side for block in cells for side in _sides(points, block)]
     heads = [_padded(np.sort(head, axis=1)) for head in [*(s.heads for s in sides), *asked]]
     cuts = np.cumsum([len(head) for head in heads])
-    numbers = np.split(_numbered(np.concatenate(heads)), cuts[:-1])
+    numbers = np.split(numbered(np.concatenate(heads)), cuts[:-1])
     own, wanted = np.concatenate(numbers[: len(sides)]), numbers[len(sides) :]
     total = max((int(n.max(initial=-1)) for n in numbers), default=-1) + 1
     count = np.bincount(own, minlength=total)
@@ -74,7 +74,7 @@ def _sides(points: np.ndarray, cells: Cells) -> Iterator[Sides]:
     for k, (facet, vector) in enumerate(zip(FACETS[cells.base], vectors)):
         sign = np.sign(volume) * (2 * k - 1 if dim == 1 else 1)
         height = dim * abs(volume) / np.maximum(np.linalg.norm(vector, axis=1), 1e-300)
-        yield Sides(facet_nodes(cells, facet), len(facet), sign, height)
+        yield Sides(facet_nodes(cells, facet), len(facet), sign, height, cells.nodes)
 
 
 def _size(at: np.ndarray) -> np.ndarray:
@@ -144,13 +144,13 @@ def _run(heads: np.ndarray) -> np.ndarray:
 def check_fit(points: np.ndarray, cells: list[Cells], outer: list[Sides]) -> None:
     """Refuse outer facets that lie on each other, cross, or reach into cells: hanging nodes, seams and overlaps."""
     _check_orders(cells)
-    flat = [part for number, side in _numbered_sides(outer) for part in _simplices(points, side, number)]
-    corners, owner, nodes, sign, height = (np.concatenate(column) for column in zip(*flat))
+    pieces = [part for side in outer for part in _simplices(side)]
+    corners, own, sign, height = (np.concatenate(column) for column in zip(*pieces))
     plane = _frames(points, corners, sign)
     used = np.unique(np.concatenate([s.nodes.ravel() for s in outer]))
-    _check_seams(points, outer, plane, corners, owner, nodes, height, used)
+    _check_seams(points, outer, plane, corners, own, height, used)
     if points.shape[1] > 1:
-        _check_crossings(points, plane, corners, owner, nodes, outer)
+        _check_crossings(points, plane, corners, own, outer)
     for block in cells:
         _check_inside(points, block, used)
     _check_pinches(points.shape[1], outer)
@@ -169,18 +169,11 @@ def _check_orders(cells: list[Cells]) -> None:
             )
 
 
-def _numbered_sides(outer: list[Sides]) -> Iterator[tuple[np.ndarray, Sides]]:
-    start = 0
-    for side in outer:
-        yield np.arange(start, start + len(side.nodes)), side
-        start += len(side.nodes)
-
-
-def _simplices(points: np.ndarray, side: Sides, number: np.ndarray) -> list[tuple[np.ndarray, ...]]:
-    """Facets as points, segments and triangles: corners (M, D), the facet they are of, all its nodes (M, 9)."""
-    nodes = np.pad(side.nodes, ((0, 0), (0, 9 - side.nodes.shape[1])), constant_values=-1)
+def _simplices(side: Sides) -> list[tuple[np.ndarray, ...]]:
+    """Facets as points, segments and triangles: corners (M, D), the nodes of their cells (M, 27), sign and height."""
+    cell = np.pad(side.cell, ((0, 0), (0, 27 - side.cell.shape[1])), constant_values=-1)
     cuts = [[0, 1, 2], [0, 2, 3]] if side.corners == 4 else [list(range(side.corners))]
-    return [(side.heads[:, cut], number, nodes, side.sign, side.height) for cut in cuts]
+    return [(side.heads[:, cut], cell, side.sign, side.height) for cut in cuts]
 
 
 def _frames(points: np.ndarray, corners: np.ndarray, sign: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -216,33 +209,39 @@ def _near(centres: np.ndarray, radii: np.ndarray, points: np.ndarray) -> Iterato
         yield np.repeat(some_balls, [len(f) for f in found]), np.concatenate([*found, []]).astype(int)
 
 
-def _check_seams(points, outer, plane, corners, owner, nodes, height, used) -> None:
-    """Refuse nodes and facets on facets that they do not belong to."""
+def _check_seams(points, outer, plane, corners, own, height, used) -> None:
+    """Refuse nodes and facets on facets of cells that they do not belong to."""
     at = points[corners]
     centres = at.mean(axis=1)
     radii = np.linalg.norm(at - centres[:, None], axis=2).max(axis=1) * (1.0 + 2.0 * _ON) + 1e-12
     size = _size(at) if points.shape[1] > 1 else height
     inward, outward = _ON * np.minimum(size, height), _ON * size
-    middles = np.concatenate([points[s.heads].mean(axis=1) for s in outer])
-    label = np.concatenate([used, -2 - np.arange(len(middles))])
-    tests = np.concatenate([points[used], middles])
+    heads = np.concatenate([_padded(s.heads) for s in outer])
+    tests = np.concatenate([points[used], *(points[s.heads].mean(axis=1) for s in outer)])
+    # A facet's middle stands for the facet: it belongs to the cell that has all its corners.
+    needs = np.concatenate([_padded(used[:, None]), heads])
     for ball, test in _near(centres, radii, tests):
-        alien = (nodes[ball] != label[test][:, None]).all(axis=1) & (owner[ball] != -2 - label[test])
-        ball, test = ball[alien], test[alien]
         inside, high = _local(plane, ball, tests[test])
-        on = np.flatnonzero((inside > -_EDGE) & (high > -inward[ball]) & (high < outward[ball]))
-        if len(on):
+        on = (inside > -_EDGE) & (high > -inward[ball]) & (high < outward[ball])
+        ball, test = ball[on], test[on]
+        on = ~_has(own[ball], needs[test])
+        if on.any():
             ball, test = ball[on], test[on]
-            hung = np.unique(label[test][label[test] >= 0])
+            hung = np.unique(used[test[test < len(used)]])
             who = f"the nodes {some(hung)} lie" if len(hung) else "facets lie"
             raise ValueError(
-                f"mesh: {who} on sides of cells that they do not belong to, as the facet with the nodes "
-                f"{[int(n) for n in nodes[ball[0]] if n >= 0]}: hanging nodes, or parts whose nodes were not merged; "
-                "refine to a conforming mesh, merge the nodes (in Gmsh: Coherence), or take parts apart"
+                f"mesh: {who} on sides of cells that they do not belong to, as the facet at the nodes "
+                f"{corners[ball[0]].tolist()}: hanging nodes, or parts whose nodes were not merged; refine to a "
+                "conforming mesh, merge the nodes (in Gmsh: Coherence), or take parts apart"
             )
 
 
-def _check_crossings(points, plane, corners, owner, nodes, outer) -> None:
+def _has(own: np.ndarray, needs: np.ndarray) -> np.ndarray:
+    """Whether all of the nodes (M, 4), -1 for none, are among others (M, n)."""
+    return ((own[:, :, None] == needs[:, None]).any(axis=1) | (needs < 0)).all(axis=1)
+
+
+def _check_crossings(points, plane, corners, own, outer) -> None:
     """Refuse edges of outer facets that pierce other outer facets: parts overlap."""
     edges = np.unique(np.concatenate(list(_outer_edges(outer))), axis=0)
     at, ends = points[corners], points[edges]
@@ -252,18 +251,17 @@ def _check_crossings(points, plane, corners, owner, nodes, outer) -> None:
     # Of an edge and a facet that meet the larger has the middle of the smaller in twice its ball.
     pairs = [*_near(centres, 2.0 * radii, middles), *((f, e) for e, f in _near(middles, 2.0 * half, centres))]
     for facet, edge in pairs:
-        alien = ~((nodes[facet] == edges[edge][:, :1]) | (nodes[facet] == edges[edge][:, 1:])).any(axis=1)
-        facet, edge = facet[alien], edge[alien]
-        start, end = ends[edge, 0], ends[edge, 1]
-        low, high = _local(plane, facet, start)[1], _local(plane, facet, end)[1]
+        low, high = (_local(plane, facet, ends[edge, k])[1] for k in (0, 1))
         across = low * high < 0
-        facet, edge, start, end, low, high = (v[across] for v in (facet, edge, start, end, low, high))
-        met = start + (end - start) * (low / (low - high))[:, None]
-        pierced = np.flatnonzero(_local(plane, facet, met)[0] > _EDGE)
-        if len(pierced):
+        facet, edge, low, high = facet[across], edge[across], low[across], high[across]
+        met = ends[edge, 0] + (ends[edge, 1] - ends[edge, 0]) * (low / (low - high))[:, None]
+        pierced = _local(plane, facet, met)[0] > _EDGE
+        facet, edge = facet[pierced], edge[pierced]
+        alien = np.flatnonzero(~(own[facet][:, :, None] == edges[edge][:, None]).any(axis=(1, 2)))
+        if len(alien):
             raise ValueError(
-                f"mesh: the edge between the nodes {edges[edge[pierced[0]]].tolist()} crosses the facet with the nodes "
-                f"{[int(n) for n in nodes[facet[pierced[0]]] if n >= 0]}: parts of the mesh overlap; take them apart"
+                f"mesh: the edge between the nodes {edges[edge[alien[0]]].tolist()} crosses the facet at the nodes "
+                f"{corners[facet[alien[0]]].tolist()}: parts of the mesh overlap; take them apart"
             )
 
 
@@ -310,7 +308,7 @@ def _check_pinches(dim: int, outer: list[Sides]) -> None:
         )
 
 
-def _numbered(rows: np.ndarray) -> np.ndarray:
+def numbered(rows: np.ndarray) -> np.ndarray:
     """Numbers (M,) that are equal where rows are."""
     order = np.lexsort(rows.T)
     new = np.ones(len(rows), int)

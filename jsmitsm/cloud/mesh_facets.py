@@ -62,12 +62,13 @@ class Cells(NamedTuple):
 
 class Sides(NamedTuple):
     """Facets of one shape: nodes (M, k), corners first; whether their normals point outward as their corners run
-    (+1 or -1); and how high their cell stands over them."""
+    (+1 or -1); how high their cell stands over them; and its nodes (M, n)."""
 
     nodes: np.ndarray
     corners: int
     sign: np.ndarray
     height: np.ndarray
+    cell: np.ndarray
 
     @property
     def heads(self) -> np.ndarray:
@@ -76,7 +77,7 @@ class Sides(NamedTuple):
 
     def of(self, mask: np.ndarray) -> Sides:
         """Some of them."""
-        return Sides(self.nodes[mask], self.corners, self.sign[mask], self.height[mask])
+        return Sides(self.nodes[mask], self.corners, self.sign[mask], self.height[mask], self.cell[mask])
 
 
 def dimension(kind: str) -> int | None:
@@ -94,7 +95,7 @@ def volume_cells(blocks: Any) -> tuple[int, list[tuple[str, np.ndarray]]]:
     """The dimension of a mesh and its cells of that dimension."""
     try:
         blocks = [(block.type, np.asarray(block.data)) for block in blocks if len(block.data)]
-    except (AttributeError, TypeError):
+    except (AttributeError, TypeError, ValueError):  # ValueError: rows of several lengths
         raise ValueError("mesh: its cells are no meshio cell blocks; make it with meshio.Mesh(points, cells)") from None
     unknown = sorted({kind for kind, _ in blocks if dimension(kind) is None})
     if unknown:

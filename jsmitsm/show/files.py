@@ -129,10 +129,10 @@ def from_csv(path: Any) -> Cloud:
         with open(_a_path(path), newline="", encoding="utf-8-sig") as file:
             reader = csv.reader(file, skipinitialspace=True, strict=True)
             lines = [(reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]
-    except OSError as error:
-        raise ValueError(f"path: cannot read {path!r} ({error}); give the path of a CSV file") from None
     except (UnicodeDecodeError, csv.Error) as error:
         raise ValueError(f"path: {path} is no text in UTF-8 ({error}); save it as CSV in UTF-8") from None
+    except (OSError, ValueError) as error:
+        raise ValueError(f"path: cannot read {path!r} ({error}); give the path of a CSV file") from None
     if len(lines) < 2:
         raise ValueError(f"path: {path} has no rows below its header")
     header = [name.strip() for name in lines[0][1]]
@@ -174,11 +174,14 @@ def to_csv(what: Cloud | Solution, path: Any) -> None:
     for name in set(columns["group"]):
         if name != name.strip() or not name or (name != INTERIOR and name.lower() == INTERIOR):
             raise ValueError(f"what: the name {name!r} of a group would not read back from CSV; rename the group")
-    with open(_a_path(path), "w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(columns)
-        for row in zip(*columns.values()):
-            writer.writerow(["" if v != v else v if isinstance(v, str) else repr(float(v)) for v in row])
+    try:
+        with open(_a_path(path), "w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file)
+            writer.writerow(columns)
+            for row in zip(*columns.values()):
+                writer.writerow(["" if v != v else v if isinstance(v, str) else repr(float(v)) for v in row])
+    except OSError as error:
+        raise ValueError(f"path: cannot write {path!r} ({error}); give the path of a file in a folder") from None
 
 
 def to_mesh(sol: Solution, **more: Any) -> Any:
@@ -303,5 +306,5 @@ def _numbers(rows: list[tuple[int, dict[str, str]]], names: list[str], path: Any
 def _a_path(path: Any) -> Any:
     """``path``, or an error: a number would be taken for an open file of the program's."""
     if not isinstance(path, (str, bytes, os.PathLike)):
-        raise ValueError(f"path: cannot read {path!r}, a {type(path).__name__}; give the path of a CSV file")
+        raise ValueError(f"path: cannot read or write {path!r}, a {type(path).__name__}; give the path of a CSV file")
     return path

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jsmitsm.cloud.cloud import INTERIOR, Cloud
-from jsmitsm.cloud.mesh_checks import Boundary, check_fit, domain_sides
+from jsmitsm.cloud.mesh_checks import Boundary, check_fit, domain_sides, numbered
 from jsmitsm.cloud.mesh_facets import (
     Sides,
     boundary_normals,
@@ -40,13 +40,14 @@ def cloud_of(mesh: Any, key: str | None, names: list[str] | None) -> Cloud:
     points = _checked_nodes(mesh.points, dim)
     check_cells(len(points), [(block.type, block.data) for block in mesh.cells if len(block.data)])
     used = np.unique(np.concatenate([block.ravel() for _, block in blocks]))
+    _check_places(points, used)
     _check_plane(points[used], dim)
     _check_attached(mesh.cells, used, dim)
     # Products of coordinates must neither overflow nor vanish: the geometry is found in units of its size.
     unit = float(np.ptp(points[used, :dim], axis=0).max()) or 1.0
     scaled = (points[:, :dim] - points[used, :dim].min(axis=0)) / unit
-    cells = with_middles(scaled, blocks)
     tags = chosen(all_tags(mesh, key), names)
+    cells = with_middles(scaled, _once(mesh, blocks, dim))
     asked = [(k, *entry) for k, tag in enumerate(tags) if tag.dim == dim - 1 for entry in tag.cells]
     corners = [mesh.cells[b].data[rows][:, : corner_count(mesh.cells[b].type)] for _, b, rows in asked]
     found = domain_sides(scaled, cells, corners)
@@ -75,6 +76,23 @@ def cloud_of(mesh: Any, key: str | None, names: list[str] | None) -> Cloud:
         normals[used],
         {name: new[nodes] for name, nodes in cell_groups.items()},
     )
+
+
+def _once(mesh: Any, blocks: list[tuple[str, np.ndarray]], dim: int) -> list[tuple[str, np.ndarray]]:
+    """The cells, each once: Gmsh 2 writes a cell of several physical groups once for each. Copies within one group
+    stay, to be refused."""
+    tags = [np.asarray(tag) for block, tag in zip(mesh.cells, mesh.cell_data.get("gmsh:physical", []))
+            if len(block.data) and dimension(block.type) == dim]  # fmt: skip
+    if not tags or len(np.unique(np.concatenate(tags))) == 1:
+        return blocks
+    out = []
+    for kind in dict.fromkeys(kind for kind, _ in blocks):
+        rows = np.concatenate([block for k, block in blocks if k == kind])
+        tag = np.concatenate([t for t, (k, _) in zip(tags, blocks) if k == kind])
+        number = numbered(np.sort(rows, axis=1))
+        first = np.unique(number, return_index=True)[1][number]
+        out.append((kind, rows[(first == np.arange(len(rows))) | (tag == tag[first])]))
+    return out
 
 
 def _owned(
@@ -176,6 +194,17 @@ def _checked_nodes(points: Any, dim: int) -> np.ndarray:
     if len(bad):
         raise ValueError(f"mesh: NaN or infinite coordinates at the points {bad[:5].tolist()}; remove or mend them")
     return array.astype(np.float64)
+
+
+def _check_places(points: np.ndarray, used: np.ndarray) -> None:
+    """Refuse nodes at one place: cells that seem to touch there do not."""
+    order = used[np.lexsort(points[used].T)]
+    same = np.flatnonzero((np.diff(points[order], axis=0) == 0).all(axis=1))
+    if len(same):
+        raise ValueError(
+            f"mesh: {len(same)} of its nodes stand where others do, as {order[same[0] : same[0] + 2].tolist()}; merge "
+            "them (in Gmsh: Coherence), or give more digits"
+        )
 
 
 def _check_plane(points: np.ndarray, dim: int) -> None:

@@ -38,6 +38,7 @@ def read_mesh(path: Any) -> Any:
     try:
         with contextlib.redirect_stderr(said), contextlib.redirect_stdout(said), warnings.catch_warnings():
             # numpy stops at what is no number, and meshio goes on with what came before.
+            warnings.simplefilter("ignore")
             warnings.filterwarnings("error", message=".*could not be read to its end")
             mesh = _OWN[extension](name) if meshio is None else meshio.read(name, kind)
     except ModuleNotFoundError as error:

@@ -34,6 +34,7 @@ def all_tags(mesh: Any, key: str | None) -> list[Tag]:
     names = _names(mesh.field_data)
     if key is not None:
         values = [_whole(key, v) for v in mesh.cell_data[key]]
+        _check_lengths(f"cell data {key!r}", [len(v) for v in values], [len(block.data) for block in mesh.cells])
         if key == "gmsh:physical":  # the sign is a direction, and zero is none
             values = [abs(v) for v in values]
         every = {(d, n) for d, v in zip(dims, values) for n in np.unique(v).tolist() if n or key != "gmsh:physical"}
@@ -45,6 +46,7 @@ def all_tags(mesh: Any, key: str | None) -> list[Tag]:
         # Gmsh's bounding entities and the like are no groups of the user's; its names tell of cells with several tags.
         if name.startswith("gmsh:") or (key is not None and name not in names.values()):
             continue
+        _check_lengths(f"set {name!r}", [1] * len(members), [1] * len(mesh.cells))
         for k, rows in enumerate(members):
             if rows is not None and len(rows):
                 found.setdefault((name, dims[k]), []).append((k, _rows(name, rows, len(mesh.cells[k].data))))
@@ -112,6 +114,12 @@ def _whole(key: str, values: Any) -> np.ndarray:
     if values.dtype.kind not in "iuf" or not (np.isfinite(values) & (values == np.round(values))).all():
         raise ValueError(f"tags: the cell data {key!r} are no whole numbers; number the sides 1, 2, ...")
     return values.astype(int)
+
+
+def _check_lengths(what: str, came: list[int], wanted: list[int]) -> None:
+    """Refuse data that do not go with the blocks of cells."""
+    if came != wanted:
+        raise ValueError(f"mesh: its {what} has blocks of lengths {came}, its cells of {wanted}; write the mesh again")
 
 
 def _rows(name: str, rows: Any, count: int) -> np.ndarray:
