@@ -20,8 +20,11 @@ _ON = 1e-3
 _EDGE = 1e-8
 
 
+Frames = tuple[np.ndarray, np.ndarray]  # the origins and inverse frames of simplices
+
+
 class Boundary(NamedTuple):
-    """The facets on the boundary, and by the number of a facet in any order of its corners how many cells have it."""
+    """The facets on the boundary, and by the number of a facet (in any order of its corners) how many cells have it."""
 
     outer: list[Sides]
     cells: np.ndarray
@@ -176,7 +179,7 @@ def _simplices(side: Sides) -> list[tuple[np.ndarray, ...]]:
     return [(side.heads[:, cut], cell, side.sign, side.height) for cut in cuts]
 
 
-def _frames(points: np.ndarray, corners: np.ndarray, sign: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _frames(points: np.ndarray, corners: np.ndarray, sign: np.ndarray) -> Frames:
     """Origin and inverse frame of every simplex: its edges and the outward unit normal."""
     at = points[corners]
     normal = area(at) * sign[:, None]
@@ -190,7 +193,7 @@ def _frames(points: np.ndarray, corners: np.ndarray, sign: np.ndarray) -> tuple[
     return at[:, 0], inverse
 
 
-def _local(plane: tuple[np.ndarray, np.ndarray], which: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _local(plane: Frames, which: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The smallest barycentric coordinate of points in simplices, and the height over them."""
     local = np.einsum("mij,mj->mi", plane[1][which], x - plane[0][which])
     inside = np.column_stack([local[:, :-1], 1.0 - local[:, :-1].sum(axis=1)])
@@ -209,7 +212,10 @@ def _near(centres: np.ndarray, radii: np.ndarray, points: np.ndarray) -> Iterato
         yield np.repeat(some_balls, [len(f) for f in found]), np.concatenate([*found, []]).astype(int)
 
 
-def _check_seams(points, outer, plane, corners, own, height, used) -> None:
+def _check_seams(
+    points: np.ndarray, outer: list[Sides], plane: Frames, corners: np.ndarray, own: np.ndarray, height: np.ndarray,
+    used: np.ndarray,
+) -> None:  # fmt: skip
     """Refuse nodes and facets on facets of cells that they do not belong to."""
     at = points[corners]
     centres = at.mean(axis=1)
@@ -241,7 +247,9 @@ def _has(own: np.ndarray, needs: np.ndarray) -> np.ndarray:
     return ((own[:, :, None] == needs[:, None]).any(axis=1) | (needs < 0)).all(axis=1)
 
 
-def _check_crossings(points, plane, corners, own, outer) -> None:
+def _check_crossings(
+    points: np.ndarray, plane: Frames, corners: np.ndarray, own: np.ndarray, outer: list[Sides]
+) -> None:
     """Refuse edges of outer facets that pierce other outer facets: parts overlap."""
     edges = np.unique(np.concatenate(list(_outer_edges(outer))), axis=0)
     at, ends = points[corners], points[edges]

@@ -211,11 +211,6 @@ def side_normals(points: np.ndarray, sides: list[Sides]) -> np.ndarray:
     return normals
 
 
-def among(outer: list[Sides], members: np.ndarray) -> list[Sides]:
-    """The facets all of whose nodes are ``members``, a mask (N,)."""
-    return [sides.of(members[sides.nodes].all(axis=1)) for sides in outer]
-
-
 def _add_normals(total: np.ndarray, points: np.ndarray, sides: Sides) -> None:
     """Add every facet's unit normals at its nodes, weighted by the facet's angle there."""
     dim, head = points.shape[1], points[sides.heads]

@@ -31,7 +31,7 @@ def all_tags(mesh: Any, key: str | None) -> list[Tag]:
         key = next((k for k in _KEYS if k in mesh.cell_data), None)
     elif key not in mesh.cell_data:
         raise ValueError(f"tags: {key!r} is none of the mesh's cell data {sorted(mesh.cell_data)}{_meant(key, mesh)}")
-    names = _names(mesh.field_data)
+    names = {} if key == "gmsh:geometrical" else _names(mesh.field_data)  # those are of physical groups
     if key is not None:
         values = [_whole(key, v) for v in mesh.cell_data[key]]
         _check_lengths(f"cell data {key!r}", [len(v) for v in values], [len(block.data) for block in mesh.cells])
