@@ -282,6 +282,10 @@ def test_a_list_of_names_chooses_groups_and_who_is_first():
         from_mesh(mesh, tags="gmsh:phisical")
     with pytest.raises(ValueError, match="tags: 'left' is none .*chosen by a list"):
         from_mesh(mesh, tags="left")
+    loose = meshio.Mesh([*NINE, [5, 5]], [("quad", QUADS)], point_sets={"anchor": np.array([9]), "left": np.array([0, 3])})
+    assert names(from_mesh(loose))["left"] == [0, 3]
+    with pytest.raises(ValueError, match="tags: the group 'anchor' has no node in the domain"):
+        from_mesh(loose, tags=["left", "anchor"])
     for wrong in (3, [], [3], {"a": 1}):
         with pytest.raises(ValueError, match="tags: expected the name of cell data, or a list"):
             from_mesh(mesh, tags=wrong)

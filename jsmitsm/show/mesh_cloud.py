@@ -68,6 +68,10 @@ def cloud_of(mesh: Any, key: str | None, names: list[str] | None) -> Cloud:
             f"tags: the cell data {key!r} name no side of the domain and tell no materials apart; tag its boundary "
             "facets, or leave tags out"
         )
+    there = {tag.name for tag, n in zip(tags, named) if len(n.border) or (n.inside is not None and len(n.inside))}
+    for name in names or ():
+        if name not in there:
+            raise ValueError(f"tags: the group {name!r} has no node in the domain; leave it out, or mesh it too")
     new = np.cumsum(live) - 1
     groups, normals = _owned(scaled, found.outer, border & live, claims, facets)
     return Cloud(
