@@ -53,9 +53,10 @@ PHASE = (0.9, 3.5)
 CLEARED = 0.03
 # ... unless what is missed between the particles would make so much of the solution.
 MISSED = 0.5
-# Measures below this part of their bounds clear a solution without an estimate. Fronts are wrong by their whole size
-# at a third of the bounds.
-HINT = 0.3
+# Measures below these clear a solution without an estimate. Of 250 random linear problems these cleared 53, all of them
+# right to 0.3 %; at three times these a beam was wrong by 17 %.
+CLEAR = {"roughness": 0.05, "source": 0.01, "excess": 10.0, "coefficient": 0.1}
+CLEAR_WAVE = 0.1  # of PHASE
 # The operator's coefficients at a neighbour differ from their Taylor polynomials by this part of the largest term.
 COEFFICIENT = 0.3
 # Beyond so many particles an error estimate would cost more than a look at the flags may.
@@ -99,10 +100,11 @@ def _cleared(run: Any, found: dict[str, float], doubts: list[str]) -> bool:
     disc = run.disc
     if doubts or run.formulation == "lsq" or not disc.linear or disc.rec.fields > 1:
         return False
-    high = disc.rec.order > 3
-    bounds = {"roughness": ROUGH[high], "source": SOURCE, "wave": PHASE[high], "excess": 10.0 / HINT,
-              "coefficient": COEFFICIENT}  # fmt: skip
-    return all(found.get(name, 0.0) <= HINT * bound for name, bound in bounds.items())
+    order = max(disc.rec.order - q for q in disc.rec.degrees)
+    if order > 2 and "source" not in found:  # nothing was measured but the roughness
+        return False
+    limits = {**CLEAR, "wave": CLEAR_WAVE * PHASE[disc.rec.order > 3]}
+    return all(found.get(name, 0.0) <= limit for name, limit in limits.items())
 
 
 def share(error: np.ndarray, values: np.ndarray) -> float:
