@@ -59,6 +59,8 @@ CLEAR = {"roughness": 0.05, "source": 0.01, "excess": 10.0, "coefficient": 0.1}
 CLEAR_WAVE = 0.1  # of PHASE
 # The operator's coefficients at a neighbour differ from their Taylor polynomials by this part of the largest term.
 COEFFICIENT = 0.3
+# The estimate passes through the same inverse: of a condition so many times the usual one it can tell nothing.
+BLIND = 1e5
 # Beyond so many particles an error estimate would cost more than a look at the flags may.
 MANY = 200_000
 
@@ -79,7 +81,7 @@ def flags(run: Any, values: Any, nums: Any, estimated: Callable[[], float]) -> t
         test(run, values, nums, certain, found)
     for test in (_condition, _misfit, _waves, _roughness, _source, _coefficients, _weakness, _peclet):
         test(run, values, nums, doubts, found)
-    if certain or found.get("misfit", 0.0) > HOPELESS_MISFIT:
+    if certain or found.get("misfit", 0.0) > HOPELESS_MISFIT or found.get("excess", 0.0) > BLIND:
         return doubts + certain, found
     if len(run.disc.cloud) > MANY or _cleared(run, found, doubts):
         return doubts + certain, found

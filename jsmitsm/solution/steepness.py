@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
+from itertools import product
 
 import numpy as np
 
@@ -14,6 +14,8 @@ from jsmitsm.taylor.multi_indices import multi_indices
 
 # A coefficient that changes between neighbours by this part of the larger value jumps.
 JUMP = 0.5
+# So many particles at a time.
+CHUNK = 8192
 
 
 def steepness(disc: Discretization, nums: Numbers) -> np.ndarray:
@@ -70,9 +72,10 @@ def _pairs(disc: Discretization, nums: Numbers) -> Iterator[tuple[np.ndarray, np
     points, place = np.asarray(disc.points, float), np.full(len(disc.cloud), -1)
     place[nums.ids] = np.arange(len(nums.ids))
     for cls in disc.classes:
-        near: Any = np.asarray(cls.neighbours)
+        near = np.asarray(cls.neighbours)[:, : 1 + 2 * disc.rec.dim]
         owners = np.asarray(disc.images.owners(near))
-        for k in range(1, min(1 + 2 * disc.rec.dim, near.shape[1])):
-            both = (near[:, k] >= 0) & (place[np.maximum(owners[:, k], 0)] >= 0)
-            ids, other = cls.ids[both], near[both, k]
-            yield ids, place[ids], place[owners[both, k]], points[other] - points[ids]
+        for start, k in product(range(0, len(near), CHUNK), range(1, near.shape[1])):
+            some = slice(start, start + CHUNK)
+            both = (near[some, k] >= 0) & (place[np.maximum(owners[some, k], 0)] >= 0)
+            ids = cls.ids[some][both]
+            yield ids, place[ids], place[owners[some, k][both]], points[near[some, k][both]] - points[ids]
