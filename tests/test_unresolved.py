@@ -49,9 +49,9 @@ def laminate(width, n, dim, aspect=0.0, **options):
                               (0.01, 21, 2, 5.0)],
 )  # fmt: skip
 def test_a_conductivity_steeper_than_the_cloud_resolves(width, n, dim, aspect):
-    """26 to 34 % off on the line, less between sides that know the values; narrow steps no particle sees at all."""
+    """25 to 34 % off on the line, less between sides that know the values; narrow steps no particle sees at all."""
     sol, exact = laminate(width, n, dim, aspect)
-    assert away(sol, exact) > (0.25 if dim == 1 else 0.04) and any("coefficient" in flag for flag in sol.flags)
+    assert away(sol, exact) > (0.2 if dim == 1 else 0.04) and any("coefficient" in flag for flag in sol.flags)
 
 
 def test_a_conductivity_that_the_cloud_resolves():
