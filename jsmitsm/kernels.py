@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jsmitsm.snapshot import ScalarFunction, shape_of
 from jsmitsm.tracers import is_traced
 
 # A particle that sits on the edge of a support belongs to it; rounding must not decide that.
@@ -65,6 +66,20 @@ class Kernel:
     def weight(self, r: Any) -> Any:
         """The weight at the scaled distance ``r`` (any shape), zero outside the support."""
         return jnp.where(r <= self.d * EDGE, self.profile(r), 0.0)
+
+    def recorded(self) -> Kernel:
+        """The same kernel with the user's profile as it is now: compiled programs are kept under what it computes."""
+        if self._profile is None or isinstance(self._profile, ScalarFunction):
+            return self
+        profile = ScalarFunction(self._profile, *(() if self.params is None else (self.params,)))
+        return self if profile.traced else self._with(profile)
+
+    def as_written(self) -> Kernel:
+        """The same kernel with the profile that the user wrote."""
+        return self._with(self._profile.function) if isinstance(self._profile, ScalarFunction) else self
+
+    def _with(self, profile: Callable[..., Any]) -> Kernel:
+        return type(self).tree_unflatten(profile, (self.h, self.d, self.params))
 
     @property
     def length(self) -> Any:
@@ -219,7 +234,7 @@ def _check_profile(kernel: Kernel) -> None:
     """Call a user's profile once without numbers: its signature and shape come to light."""
     said = "profile: expected a jax.numpy function of the scaled distance r (and of params, where given)"
     try:
-        shape = np.shape(jax.eval_shape(kernel.profile, jax.ShapeDtypeStruct((), jnp.result_type(float))))
+        shape = np.shape(shape_of(kernel.profile, jax.ShapeDtypeStruct((), jnp.result_type(float))))
     except Exception as error:
         raise ValueError(f"{said}, but calling it failed: {error}") from error
     if shape != ():

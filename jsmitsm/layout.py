@@ -96,6 +96,7 @@ def discretize(
 
     sources: whether the weights of the source are wanted even where it is zero.
     """
+    kernel = kernel and kernel.recorded()
     traced = _traced(problem, cloud.dim)
     _check_operator(traced, problem, order)
     rec = recursion(cloud.dim, order, problem.fields, traced.slots, traced.pattern, traced.order)

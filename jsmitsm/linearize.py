@@ -14,6 +14,7 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 from jsmitsm.elementwise import ELEMENTWISE
 from jsmitsm.jaxprs import EVERYTHING, bind, called, levels, literal
 from jsmitsm.operators import Field, LocalField, field_p, frozen_p
+from jsmitsm.snapshot import snapshot
 from jsmitsm.taylor import Slot
 
 # What a value of the traced residual is to the point: the point itself, dependent on it, or not.
@@ -313,8 +314,8 @@ def record(
     dtype = jnp.result_type(float)
     point = jax.ShapeDtypeStruct((field.dim,), dtype)
     others = [jax.ShapeDtypeStruct(tuple(shape), dtype) for shape in extras]
-    first = jax.make_jaxpr(lambda x, e, p: _values(residual(field, x, *e, *(() if params is None else (p,))), dtype))(
-        point, others, params
+    first = snapshot(
+        lambda x, e, p: _values(residual(field, x, *e, *(() if params is None else (p,))), dtype), point, others, params
     )
     flat: Any = first.jaxpr
     check_points(flat, [POINT] + [FREE] * (len(flat.invars) - 1))

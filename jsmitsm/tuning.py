@@ -113,6 +113,7 @@ def tune(
     names = _checked_names(kernel, parameters)
     _check_input(problem, cloud, kernel, objective, optimizer, steps, solve_options)
     options = {"method": "S", "order": 4, **solve_options}
+    kernel = kernel.recorded()
     space = ParameterMap(kernel, names, _checked_groups(groups, cloud, names))
     with bar("tune", steps, progress) as shown:
         scored = Objective(problem, cloud, kernel, objective, options)
@@ -122,7 +123,7 @@ def tune(
         if not scored.linear:
             options["u0"] = best.score.values
         solution = solve(problem, cloud, kernel=best.kernel, **options)
-    return TuneResult(best.kernel, solution, search.history(), search.messages, scored.solves + 1)
+    return TuneResult(best.kernel.as_written(), solution, search.history(), search.messages, scored.solves + 1)
 
 
 # ------------------------------------------------------------------ input
