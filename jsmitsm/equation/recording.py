@@ -129,13 +129,11 @@ def _looked_up(value: Any, chains: frozenset[tuple[str, ...]], seen: dict[int, i
         return _value(value, seen)
     if () in chains:  # it is handed on, and may be asked for anything
         raise Unknown
-    parts: dict[str, set[tuple[str, ...]]] = {}
-    for first, *rest in sorted(chains):
-        parts.setdefault(first, set()).add(tuple(rest))
     found = []
-    for name, rest in parts.items():
+    for name in sorted({chain[0] for chain in chains}):
+        further = frozenset(chain[1:] for chain in chains if chain[0] == name)
         try:
-            found.append((name, _looked_up(attribute(value, name), frozenset(rest), seen)))
+            found.append((name, _looked_up(attribute(value, name), further, seen)))
         except AttributeError:
             raise Unknown from None
     return tuple(found)

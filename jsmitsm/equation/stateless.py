@@ -113,8 +113,8 @@ def _ours(value: Any) -> bool:
 
 def _module_of(function: types.FunctionType) -> str | None:
     """The name of the module of a library that a function was written in."""
-    name = function.__globals__.get("__name__")
-    module = sys.modules.get(name) if isinstance(name, str) else None
+    name = str(function.__globals__.get("__name__"))
+    module = sys.modules.get(name)
     there = module is not None and vars(module) is function.__globals__
     return name if there and name.partition(".")[0] in _LIBRARIES else None
 
