@@ -8,7 +8,7 @@ from jsmitsm.cloud.neighbours import Stencils, stencils
 from jsmitsm.equation.operators import divergence, grad, hessian, laplacian, partial
 from jsmitsm.equation.problem import Condition, Problem, condition, dirichlet, fix, free, neumann, periodic, robin
 from jsmitsm.particle.kernels import Constant, CubicSpline, Gaussian, Kernel, SuperGaussian, Wendland
-from jsmitsm.runtime.errors import SolveError
+from jsmitsm.runtime.errors import SolveError, did_you_mean
 from jsmitsm.runtime.progress import no_progress
 from jsmitsm.solution.factorization import Factorization, factorize
 from jsmitsm.solution.solution import Solution
@@ -48,7 +48,8 @@ def __getattr__(name: str) -> Any:
         return import_module(f"jsmitsm.{_LAZY[name]}.{name}")
     if name in _LAZY:
         return getattr(import_module(f"jsmitsm.{_LAZY[name]}"), name)
-    raise AttributeError(f"module 'jsmitsm' has no attribute {name!r}")
+    known = "" if name.startswith("_") else did_you_mean(name, __all__)
+    raise AttributeError(f"module 'jsmitsm' has no attribute {name!r}{known}")
 
 
 def __dir__() -> list[str]:

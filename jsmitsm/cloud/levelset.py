@@ -12,6 +12,7 @@ import numpy as np
 from jsmitsm.cloud import filling
 from jsmitsm.cloud.filling import Spacing
 from jsmitsm.runtime.compiled import fingerprint, kept
+from jsmitsm.runtime.errors import IN_FUNCTIONS, in_words
 from jsmitsm.runtime.jaxprs import inlined
 from jsmitsm.runtime.snapshot import shape_of, snapshot
 
@@ -133,11 +134,11 @@ def _check_shape(sdf: Any, dim: int) -> None:
         )
     try:
         out = shape_of(sdf, jax.ShapeDtypeStruct((dim,), jnp.float64))
-    except (TypeError, ValueError, IndexError) as error:
+    except IN_FUNCTIONS as error:
         raise ValueError(
             f"sdf: failed for one point x of shape ({dim},), the dimension of the bounds; write it with "
             "jax.numpy, jnp.where in place of if, for points of that dimension "
-            f"({type(error).__name__}: {str(error).splitlines()[0]})"
+            f"({type(error).__name__}: {in_words(error).splitlines()[0]})"
         ) from error
     if getattr(out, "shape", None) != () or not jnp.issubdtype(out.dtype, jnp.floating):
         raise ValueError(

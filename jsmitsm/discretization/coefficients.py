@@ -20,6 +20,11 @@ from jsmitsm.taylor.series import Ring, mul
 
 # Coefficients and sources up to this have squares that are numbers.
 LARGEST = 1e150
+_SINGLE = (
+    "they must be finite and smooth there, and no larger than 3e38, where the numbers of float32 end, in which JAX "
+    'computes here: enable float64 with jax.config.update("jax_enable_x64", True), or measure lengths in units of the '
+    "size of the domain"
+)
 
 
 @dataclass
@@ -99,7 +104,8 @@ def _refuse_nonfinite(points: Any, *series: Any) -> None:
         bad = np.flatnonzero(~np.isfinite(np.asarray(values)).all(axis=tuple(range(np.ndim(values) - 1))))
         raise ValueError(
             f"pde: NaN or infinity at {len(bad)} particle(s), first at x = {np.asarray(points)[bad[0]]}, in the "
-            "coefficients, the source or their derivatives; they must be finite and smooth there"
+            "coefficients, the source or their derivatives; "
+            + (_SINGLE if np.asarray(values).dtype == np.float32 else "they must be finite and smooth there")
         )
 
 

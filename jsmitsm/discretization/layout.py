@@ -12,13 +12,14 @@ from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.cloud.neighbours import Stencils
 from jsmitsm.discretization.periodic import Images, periodic_images, with_corners
 from jsmitsm.discretization.supports import check_supports, cut_off, default_kernel, find_stencils
-from jsmitsm.equation.conditions import Group, group_conditions, in_words
+from jsmitsm.equation.conditions import Group, group_conditions
 from jsmitsm.equation.problem import Problem
 from jsmitsm.equation.tracing import Traced, trace
 from jsmitsm.particle.elimination import Scheme
 from jsmitsm.particle.kernels import Constant, Kernel
 from jsmitsm.particle.recursion import Recursion, free_indices, recursion
 from jsmitsm.runtime.compiled import at_hand
+from jsmitsm.runtime.errors import IN_FUNCTIONS, in_words
 from jsmitsm.runtime.tracers import is_traced
 
 
@@ -248,7 +249,7 @@ def _traced(problem: Problem, dim: int) -> Traced:
         pass
     try:
         return trace(problem.pde, dim, problem.fields, params=problem.params)
-    except (TypeError, ValueError, IndexError) as error:
+    except IN_FUNCTIONS as error:
         text = in_words(error)
         raise ValueError(text if text.startswith("pde") else f"pde: {text}; it returns a number or a scalar per "
                          "equation") from error  # fmt: skip

@@ -27,7 +27,7 @@ from jsmitsm.equation.stateless import attribute, made_by_library, of_library, s
 # Recorded functions kept, and the largest array compared by its contents.
 _KEPT = 256
 _LARGEST = 100_000
-_ATOMS = frozenset({type(None), type(Ellipsis), bool, int, str, bytes, complex, range})
+_ATOMS = frozenset({type(None), type(Ellipsis), bool, int, str, bytes})
 # Settings of JAX that change what is recorded.
 _SETTINGS = (
     "jax_enable_x64", "jax_numpy_dtype_promotion", "jax_numpy_rank_promotion", "jax_default_matmul_precision",
@@ -64,6 +64,10 @@ def _value(value: Any, seen: dict[int, int]) -> Any:
         return kind, value
     if kind is float:
         return kind, value.hex()  # 0.0 and -0.0 differ
+    if kind is complex:
+        return kind, value.real.hex(), value.imag.hex()
+    if kind is range:
+        return kind, value.start, value.stop, value.step
     if isinstance(value, jax.Array | np.ndarray | np.generic):
         return _array(value)
     if stateless(value):
@@ -95,7 +99,7 @@ def _array(value: Any) -> Any:
     plain = kind is np.ndarray and value.ndim or isinstance(value, np.generic) and kind.__module__ == "numpy"
     if not plain or value.dtype.kind not in "biufc":
         raise Unknown
-    return kind, value.shape, value.dtype.str, value.tobytes()
+    return kind, value.shape, value.strides, value.dtype.str, value.tobytes()
 
 
 def _function(function: types.FunctionType, seen: dict[int, int]) -> Any:

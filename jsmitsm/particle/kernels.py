@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jsmitsm.runtime.errors import did_you_mean, in_words, short
 from jsmitsm.runtime.snapshot import ScalarFunction, shape_of
 from jsmitsm.runtime.tracers import is_traced
 
@@ -95,7 +96,8 @@ class Kernel:
         """The same kernel with other ``changes``: ``h``, ``d`` or ``params``; ValueError for other names."""
         unknown = sorted(set(changes) - {"h", "d", "params"})
         if unknown:
-            raise ValueError(f"{unknown[0]}: no parameter of {type(self).__name__}; it has 'h', 'd' and 'params'")
+            raise ValueError(f"{unknown[0]}: no parameter of {type(self).__name__}; it has 'h', 'd' and 'params'"
+                             + did_you_mean(unknown[0], ("h", "d", "params")))  # fmt: skip
         _, aux = self.tree_flatten()
         for name, dims in (("h", (0, 1)), ("d", (0,))):
             if name in changes:
@@ -220,8 +222,8 @@ def _checked(value: Any, name: str, dims: tuple[int, ...]) -> Any:
         array = np.asarray(value)
         if array.dtype.kind not in "fiu":
             raise TypeError
-    except (TypeError, ValueError):
-        raise ValueError(f"{name}: expected a positive number, got {value!r}") from None
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError(f"{name}: expected a positive number, got {short(value)}") from None
     if array.ndim not in dims or not array.size:
         kinds = "a scalar or an (N,) array" if 1 in dims else "a scalar"
         raise ValueError(f"{name}: expected {kinds}, got an array of shape {array.shape}")
@@ -236,7 +238,7 @@ def _check_profile(kernel: Kernel) -> None:
     try:
         shape = np.shape(shape_of(kernel.profile, jax.ShapeDtypeStruct((), jnp.result_type(float))))
     except Exception as error:
-        raise ValueError(f"{said}, but calling it failed: {error}") from error
+        raise ValueError(f"{said}, but calling it failed: {in_words(error)}") from error
     if shape != ():
         raise ValueError(f"{said} that returns a scalar for a scalar, got shape {shape}")
 

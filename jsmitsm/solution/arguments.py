@@ -12,6 +12,7 @@ from jsmitsm.discretization.layout import Discretization, discretize
 from jsmitsm.equation.problem import Problem
 from jsmitsm.linear.linsolve import SOLVERS
 from jsmitsm.particle.kernels import Kernel
+from jsmitsm.runtime.errors import did_you_mean, short
 from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.taylor.multi_indices import HIGHEST
 
@@ -44,17 +45,17 @@ def check(
         (method, METHODS, "method"), (formulation, ("auto", "loo", "lsq"), "formulation"), (solver, SOLVERS, "solver")
     ):  # fmt: skip
         if value not in known:
-            raise ValueError(f"{name}: {value!r} is none of {', '.join(map(repr, known))}")
+            raise ValueError(f"{name}: {value!r} is none of {', '.join(map(repr, known))}{did_you_mean(value, known)}")
     if formulation == "lsq" and method != "S":
         raise ValueError(f'formulation: "lsq" is a form of method S, not of {method!r}; use method="S" or "loo"')
     if stencils is not None and any(c.kind == "periodic" for cs in problem.bcs.values() for c in cs):
         raise ValueError("stencils: those of a cloud do not reach periodic images; leave stencils out")
     if not isinstance(throw, (bool, np.bool_)):
-        raise ValueError(f"throw: expected True or False, got {throw!r}")
+        raise ValueError(f"throw: expected True or False, got {short(throw)}")
     _check_start(u0, (len(cloud), problem.fields))
     if isinstance(order, bool) or not isinstance(order, (int, np.integer)) or not 1 <= order <= HIGHEST:
         raise ValueError(
-            f"order: expected a whole number from 1 to {HIGHEST}, the degree of the expansions, got {order!r}"
+            f"order: expected a whole number from 1 to {HIGHEST}, the degree of the expansions, got {short(order)}"
         )
 
 
@@ -66,8 +67,8 @@ def _check_start(u0: Any, shape: tuple[int, int]) -> None:
         if np.iscomplexobj(u0):
             raise TypeError
         values = np.asarray(u0, float)
-    except (TypeError, ValueError):
-        raise ValueError(f"u0: expected a function of x or an array, got {u0!r}") from None
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError(f"u0: expected a function of x or an array, got {short(u0)}") from None
     if values.shape not in (shape, shape[:1]):
         raise ValueError(f"u0: expected a function, ({shape[0]},) or {shape}, got shape {values.shape}")
     if not np.isfinite(values).all():
