@@ -909,6 +909,32 @@ def a_branch_in_jax(patch, path):
 
 
 @way
+def a_loop_over_rows_in_jax(patch, path):
+    return lambda: jax.lax.map(lambda x: x * K, jnp.ones(1))[0], _global(patch)
+
+
+def times_k(x):
+    return x * K
+
+
+@way
+def a_piece_of_a_function_in_jax(patch, path):
+    return lambda: jnp.piecewise(jnp.ones(1), [jnp.ones(1) > 0], [times_k, 0.0])[0], _global(patch)
+
+
+@way
+def a_function_recomputed_by_jax(patch, path):
+    again = jax.checkpoint(times_k)
+    return lambda: again(1.0), _global(patch)
+
+
+@way
+def a_ufunc_of_jax(patch, path):
+    again = jnp.frompyfunc(lambda x, y: x + y * K, 2, 1)
+    return lambda: again.reduce(jnp.array([0.0, 1.0])), _global(patch)
+
+
+@way
 def a_function_with_a_rule(patch, path):
     f = jax.custom_jvp(lambda x: K * x)
     f.defjvp(lambda x, dx: (K * x[0], K * dx[0]))

@@ -105,7 +105,10 @@ def spacing(read):
 
 
 # A spacing is called with numbers, not recorded: JAX itself keeps an older state of these, whoever calls them.
-KEPT_BY_JAX = ("a_jitted_helper", "the_body_of_a_loop_in_jax", "a_branch_in_jax")
+KEPT_BY_JAX = (
+    "a_jitted_helper", "the_body_of_a_loop_in_jax", "a_branch_in_jax", "a_loop_over_rows_in_jax", "a_ufunc_of_jax",
+    "a_piece_of_a_function_in_jax", "a_function_recomputed_by_jax",
+)  # fmt: skip
 
 
 def cases():

@@ -8,13 +8,14 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.extend.core import ClosedJaxpr
 
 from jsmitsm.cloud import filling
 from jsmitsm.cloud.filling import Spacing
 from jsmitsm.runtime.compiled import fingerprint, kept
 from jsmitsm.runtime.errors import IN_FUNCTIONS, in_words
 from jsmitsm.runtime.jaxprs import inlined
-from jsmitsm.runtime.snapshot import shape_of, snapshot
+from jsmitsm.runtime.snapshot import snapshot
 
 _BATCH = 1024  # every call is padded to this size: one compilation per function and dimension
 LEAST = 5.0  # spacings round a boundary component below which its shape is lost
@@ -27,10 +28,11 @@ class Boundary(NamedTuple):
     normals: np.ndarray
 
 
-def _value_and_gradient(sdf: Callable[..., Any], dim: int) -> Callable[[np.ndarray], tuple[jax.Array, jax.Array]]:
-    """Of a batch of points. Recorded at once, as the function is now; one program for all that record the same."""
+def _value_and_gradient(sdf: ClosedJaxpr, dim: int) -> Callable[[np.ndarray], tuple[jax.Array, jax.Array]]:
+    """Of a batch of points; one program for all functions that record the same."""
+    value = lambda x: inlined(sdf.jaxpr, sdf.consts, [x])[0]  # noqa: E731
     batch = jax.ShapeDtypeStruct((_BATCH, dim), jnp.float64)
-    closed = snapshot(lambda x: jax.vmap(jax.value_and_grad(sdf))(x), batch)
+    closed = jax.make_jaxpr(jax.vmap(jax.value_and_grad(value)))(batch)
     jaxpr = closed.jaxpr
     program = kept(("sdf", fingerprint(jaxpr)), lambda: jax.jit(lambda consts, x: inlined(jaxpr, consts, [x])))
     return lambda x: program(closed.consts, x)
@@ -42,8 +44,7 @@ class SdfRegion:
     def __init__(self, sdf: Callable[..., Any], lo: np.ndarray, hi: np.ndarray):
         self.lo, self.hi = lo, hi
         self.size = float((hi - lo).max())
-        _check_shape(sdf, len(lo))
-        self._recorded = _value_and_gradient(sdf, len(lo))
+        self._recorded = _value_and_gradient(_recorded(sdf, len(lo)), len(lo))
         self._check_faces()
 
     def _check_faces(self) -> None:
@@ -124,7 +125,8 @@ class SdfRegion:
         return outward
 
 
-def _check_shape(sdf: Any, dim: int) -> None:
+def _recorded(sdf: Any, dim: int) -> ClosedJaxpr:
+    """The function as it is now, of one point."""
     if not callable(sdf):
         raise ValueError(f"sdf: expected a function x (D,) -> scalar, got {sdf!r}")
     if jax.dtypes.canonicalize_dtype(np.float64) != np.float64:
@@ -133,7 +135,7 @@ def _check_shape(sdf: Any, dim: int) -> None:
             'jax.config.update("jax_enable_x64", True) at the beginning of the program'
         )
     try:
-        out = shape_of(sdf, jax.ShapeDtypeStruct((dim,), jnp.float64))
+        closed, out = snapshot(sdf, jax.ShapeDtypeStruct((dim,), jnp.float64))
     except IN_FUNCTIONS as error:
         raise ValueError(
             f"sdf: failed for one point x of shape ({dim},), the dimension of the bounds; write it with "
@@ -149,6 +151,7 @@ def _check_shape(sdf: Any, dim: int) -> None:
         raise ValueError(
             f"sdf: computes in {out.dtype}, float64 was expected; drop casts and constants of lower precision"
         )
+    return closed
 
 
 def checked(region: SdfRegion, boundary: Boundary) -> Boundary:

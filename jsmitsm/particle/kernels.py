@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm.runtime.errors import did_you_mean, in_words, short
-from jsmitsm.runtime.snapshot import ScalarFunction, shape_of
+from jsmitsm.runtime.snapshot import ScalarFunction, snapshot
 from jsmitsm.runtime.tracers import is_traced
 
 # A particle that sits on the edge of a support belongs to it; rounding must not decide that.
@@ -236,7 +236,7 @@ def _check_profile(kernel: Kernel) -> None:
     """Call a user's profile once without numbers: its signature and shape come to light."""
     said = "profile: expected a jax.numpy function of the scaled distance r (and of params, where given)"
     try:
-        shape = np.shape(shape_of(kernel.profile, jax.ShapeDtypeStruct((), jnp.result_type(float))))
+        shape = np.shape(snapshot(kernel.profile, jax.ShapeDtypeStruct((), jnp.result_type(float)))[1])
     except Exception as error:
         raise ValueError(f"{said}, but calling it failed: {in_words(error)}") from error
     if shape != ():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from typing import Any
 
@@ -11,26 +12,47 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr
 
 from jsmitsm.runtime.compiled import fingerprint
-from jsmitsm.runtime.jaxprs import inlined
+from jsmitsm.runtime.jaxprs import inlined, inner_jaxprs
 from jsmitsm.runtime.tracers import is_traced
 
-# JAX looks up functions by their identity in caches of its own: the one that it is given, and those that this one gives
-# on, as the body of a loop. In a context that it has not seen before it finds none of them.
+# JAX looks up functions by their identity in caches of its own: not the one that it is given here, but those that this
+# one gives on, as the body of a loop. In a context that it has not seen before it finds none of them; but then it
+# records its own functions anew too, which takes ten times as long, and keeps them.
 _never_seen = jax.make_user_context(None)
+_JAX = os.path.join(os.path.dirname(jax.__file__), "_src")
+# Files of JAX whose jitted functions call none of the user's, but for those named.
+_OF_ARRAYS = tuple(os.path.join(_JAX, place) for place in ("numpy", "nn", "lax", os.path.join("scipy", "special")))
+_CALLING = ("ufunc_api.py", "_piecewise at ")
 
 
-def snapshot(function: Callable[..., Any], *arguments: Any) -> ClosedJaxpr:
-    """The operations of a function on such arguments, with numbers that nobody else can change."""
-    with _never_seen(object()):
-        closed = jax.make_jaxpr(lambda *a: function(*a))(*arguments)
+def snapshot(function: Callable[..., Any], *arguments: Any) -> tuple[ClosedJaxpr, Any]:
+    """The operations of a function on such arguments, with numbers that nobody else can change; its results' shapes.
+
+    What the function hands to JAX to be called is recorded as it is now as well. A jitted function with
+    ``inline=True`` leaves no mark by which it could be told: what such a one reads must not change.
+    """
+    record = lambda: jax.make_jaxpr(lambda *a: function(*a), return_shape=True)(*arguments)  # noqa: E731
+    try:
+        closed, shape = record()
+        old = any(_may_be_old(eqn) for eqn in closed.jaxpr.eqns)
+    except Exception:  # an older state may not fit; an error of the user's comes again
+        old = True
+    if old:
+        with _never_seen(object()):
+            closed, shape = record()
     consts = [_own(c, v.aval.dtype) for c, v in zip(closed.consts, closed.jaxpr.constvars, strict=True)]
-    return ClosedJaxpr(closed.jaxpr, consts)
+    return ClosedJaxpr(closed.jaxpr, consts), shape
 
 
-def shape_of(function: Callable[..., Any], *arguments: Any) -> Any:
-    """Shapes and types of what a function returns for such arguments."""
-    with _never_seen(object()):
-        return jax.eval_shape(lambda *a: function(*a), *arguments)
+def _may_be_old(eqn: Any) -> bool:
+    """Whether an operation holds what JAX recorded of another function, unless that is one of its own for arrays."""
+    known = eqn.primitive.name in ("jit", "pjit", "custom_jvp_call")
+    return any(not (known and _of_arrays(inner)) for inner in inner_jaxprs(eqn))
+
+
+def _of_arrays(jaxpr: Any) -> bool:
+    written = str(getattr(jaxpr.debug_info, "func_src_info", None))  # "name at file:line"
+    return written.partition(" at ")[2].startswith(_OF_ARRAYS) and not any(word in written for word in _CALLING)
 
 
 def _own(const: Any, dtype: Any) -> Any:
@@ -48,8 +70,7 @@ class ScalarFunction:
 
     def __init__(self, function: Callable[..., Any], *params: Any):
         self.function = function  # as written
-        self._closed = snapshot(function, jax.ShapeDtypeStruct((), jnp.result_type(float)), *params)
-        self._dtype = self._closed.in_avals[0].dtype
+        self._closed, _ = snapshot(function, jax.ShapeDtypeStruct((), jnp.result_type(float)), *params)
         consts = [(c.dtype.str, c.shape, c.tobytes()) for c in self._closed.consts if not self.traced]
         self._key = fingerprint(self._closed.jaxpr), tuple(consts)
 
@@ -59,9 +80,9 @@ class ScalarFunction:
         return is_traced(self._closed.consts)
 
     def __call__(self, r: Any, *params: Any) -> Any:
-        leaves = jax.tree.leaves(params)
+        avals = self._closed.in_avals
+        r, *leaves = (jnp.asarray(v, a.dtype) for v, a in zip([r, *jax.tree.leaves(params)], avals, strict=True))
         one = lambda x: inlined(self._closed.jaxpr, self._closed.consts, [x, *leaves])[0]  # noqa: E731
-        r = jnp.asarray(r, self._dtype)
         return one(r) if r.ndim == 0 else jax.vmap(one)(r.reshape(-1)).reshape(r.shape)
 
     def __eq__(self, other: object) -> bool:
