@@ -100,7 +100,7 @@ def _found(home: str, name: str, value: Any) -> bool:
 def _ours(value: Any) -> bool:
     """Whether it is of a library, and does not only stand there (as what a user put in a function's place)."""
     if type(value) is types.FunctionType:
-        return _module_of(value) is not None
+        return not (_module_of(value) or "jsmitsm").startswith("jsmitsm")  # this package's are read as the user's are
     if type(value) is types.BuiltinFunctionType:
         return value.__self__ is None or type(value.__self__) is types.ModuleType
     if isinstance(value, type):

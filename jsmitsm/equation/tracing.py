@@ -281,9 +281,8 @@ def trace(
     has of its own and that do not vary with x (its normal, a boundary value); ``params``, any
     pytree, passed last unless None.
 
-    The function is called once, and not again as long as all that it can see stays the same.  What
-    it closes over may be traced by JAX.  The classification is
-    read off the recorded operations, element by element; where in doubt a coefficient counts as
+    The function is called when it is first seen, and again where anything that it can see may have
+    changed.  What it closes over may be traced by JAX.  The classification is read off the recorded operations, element by element; where in doubt a coefficient counts as
     dependent, which costs time but never correctness.
 
     Raises ``ValueError`` if the field is evaluated anywhere but at x, or if the result is not a
