@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import ClosedJaxpr
+from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 
 from jsmitsm.cloud import filling
 from jsmitsm.cloud.filling import Spacing
@@ -30,9 +30,8 @@ class Boundary(NamedTuple):
 
 def _value_and_gradient(sdf: ClosedJaxpr, dim: int) -> Callable[[np.ndarray], tuple[jax.Array, jax.Array]]:
     """Of a batch of points; one program for all functions that record the same."""
-    value = lambda x: inlined(sdf.jaxpr, sdf.consts, [x])[0]  # noqa: E731
     batch = jax.ShapeDtypeStruct((_BATCH, dim), jnp.float64)
-    closed = jax.make_jaxpr(jax.vmap(jax.value_and_grad(value)))(batch)
+    closed = jax.make_jaxpr(jax.vmap(jax.value_and_grad(lambda x: jaxpr_as_fun(sdf)(x)[0])))(batch)
     jaxpr = closed.jaxpr
     program = kept(("sdf", fingerprint(jaxpr)), lambda: jax.jit(lambda consts, x: inlined(jaxpr, consts, [x])))
     return lambda x: program(closed.consts, x)

@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from jsmitsm.runtime.errors import did_you_mean, short
+from jsmitsm.runtime.errors import did_you_mean, refuse_masked, short
 from jsmitsm.runtime.tracers import is_traced
 
 
@@ -135,6 +135,7 @@ def fix(indices: Any, value: Any, field: int | None = None) -> Condition:
     >>> js.fix([12], 0.0)
     fix(indices=(12,), value=0.0)
     """
+    refuse_masked(indices, "indices")
     index = np.atleast_1d(np.array(None) if is_traced(indices) else np.asarray(indices))
     if index.ndim != 1 or index.dtype.kind not in "iu" or not index.size:
         raise ValueError(f"indices: expected particle numbers, got {short(indices)}")
@@ -163,6 +164,7 @@ def _value(value: Any, name: str) -> Any:
     """A number, array or function; anything else is refused here, where the user wrote it."""
     if callable(value) or isinstance(value, jax.core.Tracer):
         return value
+    refuse_masked(value, name)
     try:
         array = np.asarray(value)
         if array.dtype.kind not in "fiu":

@@ -282,8 +282,9 @@ def trace(
     pytree, passed last unless None.
 
     The function is called when it is first seen, and again where anything that it can see may have
-    changed.  What it closes over may be traced by JAX.  The classification is read off the recorded operations, element by element; where in doubt a coefficient counts as
-    dependent, which costs time but never correctness.
+    changed.  What it closes over may be traced by JAX.  The classification is read off the recorded
+    operations, element by element; where in doubt a coefficient counts as dependent, which costs time
+    but never correctness.
 
     Raises ``ValueError`` if the field is evaluated anywhere but at x, or if the result is not a
     scalar or a vector.

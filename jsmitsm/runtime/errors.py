@@ -9,6 +9,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 import jax
+import numpy as np
 
 # What a user's function may raise when it is called.
 IN_FUNCTIONS = (TypeError, ValueError, IndexError, AttributeError, ArithmeticError, RecursionError)
@@ -96,3 +97,20 @@ def in_words(error: Exception) -> str:
     if isinstance(error, AttributeError) and error.name is not None:
         return f"{text}{did_you_mean(error.name, dir(error.obj))}"
     return text
+
+
+def refuse_masked(value: Any, name: str) -> None:
+    """Refuse a masked array with masked entries: as an ordinary array it would show what the mask hides.
+
+    >>> import numpy as np
+    >>> refuse_masked(np.ma.array([1.0, 2.0], mask=[False, True]), "points")
+    Traceback (most recent call last):
+      ...
+    ValueError: points: 1 of its 2 entries are masked, as [1]; fill them (np.ma.filled) or drop them
+    """
+    if np.ma.isMaskedArray(value) and (hidden := np.ma.getmaskarray(value)).any():
+        first = np.argwhere(hidden)[0].tolist()
+        raise ValueError(
+            f"{name}: {hidden.sum()} of its {hidden.size} entries are masked, as {first}; fill them (np.ma.filled) or "
+            "drop them"
+        )

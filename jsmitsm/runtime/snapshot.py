@@ -9,10 +9,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import ClosedJaxpr
+from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 
 from jsmitsm.runtime.compiled import fingerprint
-from jsmitsm.runtime.jaxprs import inlined, inner_jaxprs
+from jsmitsm.runtime.jaxprs import inner_jaxprs
 from jsmitsm.runtime.tracers import is_traced
 
 # JAX looks up functions by their identity in caches of its own: not the one that it is given here, but those that this
@@ -82,7 +82,7 @@ class ScalarFunction:
     def __call__(self, r: Any, *params: Any) -> Any:
         avals = self._closed.in_avals
         r, *leaves = (jnp.asarray(v, a.dtype) for v, a in zip([r, *jax.tree.leaves(params)], avals, strict=True))
-        one = lambda x: inlined(self._closed.jaxpr, self._closed.consts, [x, *leaves])[0]  # noqa: E731
+        one = lambda x: jaxpr_as_fun(self._closed)(x, *leaves)[0]  # noqa: E731
         return one(r) if r.ndim == 0 else jax.vmap(one)(r.reshape(-1)).reshape(r.shape)
 
     def __eq__(self, other: object) -> bool:
