@@ -22,8 +22,8 @@ import jax.numpy as jnp
 import jsmitsm as js
 from benchmarks import machine
 from benchmarks.commandline import arguments
-from jsmitsm.discretization.rows import all_rows
 from jsmitsm.discretization.coefficients import numbers
+from jsmitsm.discretization.rows import all_rows
 from jsmitsm.runtime import one_kernel
 from jsmitsm.solution.arguments import discretized
 

@@ -19,10 +19,10 @@ from benchmarks import stability as st
 from benchmarks.commandline import arguments
 from benchmarks.machine import describe
 from benchmarks.problems.families import at_home, smooth
-from jsmitsm.discretization.rows import all_rows
-from jsmitsm.discretization.layout import discretize
-from jsmitsm.discretization.coefficients import numbers
 from jsmitsm.discretization import health
+from jsmitsm.discretization.coefficients import numbers
+from jsmitsm.discretization.layout import discretize
+from jsmitsm.discretization.rows import all_rows
 
 DATA = Path(__file__).parent / "data" / "repair.json"
 

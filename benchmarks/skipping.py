@@ -10,7 +10,6 @@ import json
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -22,14 +21,11 @@ import numpy as np
 import jsmitsm as js
 from benchmarks import machine
 from benchmarks.commandline import arguments
-from jsmitsm.particle import batches
-from jsmitsm.linear import linsolve
-from jsmitsm.discretization import repeated_stencils
-from jsmitsm.discretization import rows
-from jsmitsm.discretization.rows import all_rows
-from jsmitsm.discretization.layout import discretize
+from jsmitsm.discretization import repeated_stencils, rows
 from jsmitsm.discretization.coefficients import numbers
-from jsmitsm.discretization.layout import sorted_classes
+from jsmitsm.discretization.layout import discretize, sorted_classes
+from jsmitsm.discretization.rows import all_rows
+from jsmitsm.linear import linsolve
 from jsmitsm.solution.arguments import discretized
 from jsmitsm.taylor.multi_indices import count
 

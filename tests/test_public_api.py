@@ -2,13 +2,12 @@
 
 import ast
 import inspect
+import logging
 import os
 import pathlib
 import pickle
 import subprocess
 import sys
-
-import logging
 
 import jax
 import jax.numpy as jnp

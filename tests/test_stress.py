@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import jsmitsm as js
+from benchmarks import stability as st
 from jsmitsm.linear import solver_choice
 from jsmitsm.solution import run
-from benchmarks import stability as st
 
 # What an order 4 keeps on these clouds: about ten times what was measured.
 HARD = {

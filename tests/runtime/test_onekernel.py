@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 import jsmitsm as js
-from jsmitsm.runtime import whole_program
-from jsmitsm.runtime import one_kernel
+from jsmitsm.runtime import one_kernel, whole_program
 
 needs_one_kernel = pytest.mark.skipif(not one_kernel.available(), reason="this JAX makes no single kernels")
 X = np.array([0.3, -0.4, 1.2])
@@ -40,14 +39,14 @@ def test_constants_and_arguments_that_the_compiler_would_lose(function):
     source = f"""
 import jax; jax.config.update("jax_enable_x64", True)
 import numpy as np
-from tests.test_onekernel import *
+from tests.runtime.test_onekernel import *
 program, made = run({function.__name__}, x=X, unused=np.ones(7))
 want = {function.__name__}(X, np.ones(7))
 assert program.small
 for a, b in zip(made, want, strict=True):
     np.testing.assert_allclose(a, b, rtol=1e-14)
 """
-    done = subprocess.run([sys.executable, "-c", source], capture_output=True, text=True, cwd=Path(__file__).parents[1])
+    done = subprocess.run([sys.executable, "-c", source], capture_output=True, text=True, cwd=Path(__file__).parents[2])
     assert done.returncode == 0, done.stderr[-2000:]
 
 

@@ -11,9 +11,8 @@ import pytest
 
 import jsmitsm as js
 from jsmitsm.particle import batches
-
-from jsmitsm.tuning import tune as room
 from jsmitsm.tuning import objective as score_room
+from jsmitsm.tuning import tune as room
 from jsmitsm.tuning.objective import Objective, hand_kernel, reference
 
 N = 15
