@@ -10,8 +10,6 @@ import time
 from pathlib import Path
 
 import jax
-
-jax.config.update("jax_enable_x64", True)
 import numpy as np
 
 import jsmitsm as js
@@ -89,6 +87,7 @@ def cost(n=200):
 
 
 def main():
+    jax.config.update("jax_enable_x64", True)
     rows = []
     for case in cases():
         rows.append(compared(*case))
