@@ -1,4 +1,4 @@
-"""Truncated Taylor series: multi-indices, arithmetic, a rule for every JAX operation, jets of functions.
+"""Truncated Taylor series: their arithmetic, a rule for every JAX operation, jets of functions.
 
 Imports runtime.
 """
