@@ -14,7 +14,7 @@ from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.cloud.quadrature import quadrature
 from jsmitsm.particle.polynomials import derivative_table, monomials
 from jsmitsm.runtime.arrays import Array, ArrayLike, ValueOrFunction
-from jsmitsm.runtime.errors import SolveError
+from jsmitsm.runtime.errors import SolveError, refuse_masked
 from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.solution.estimate import error_estimate
 from jsmitsm.solution.fit import Recipe
@@ -273,6 +273,7 @@ class Solution:
 
 def _checked_points(points: Any, dim: int) -> Any:
     if not is_traced(points):
+        refuse_masked(points, "points")
         try:
             if np.iscomplexobj(points):
                 raise TypeError
