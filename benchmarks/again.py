@@ -24,7 +24,7 @@ import jsmitsm as js  # noqa: E402
 
 ROUNDS, REPEATS = 12, 25
 SIDES = ("left", "right", "bottom", "top")
-AMPLITUDE = 2.0
+AMPLITUDE, AT = 2.0, np.linspace(0.0, 1.0, 20)
 WAVES = {"k": np.array([1.0, 2.0]), "shift": (0.1, 0.2)}
 
 
@@ -37,7 +37,7 @@ def number(cloud, k=1.5):
     return js.solve(js.Problem(lambda u, x: js.laplacian(u)(x) - k, ends), cloud)
 
 
-def table(cloud, at=np.linspace(0.0, 1.0, 20), values=np.linspace(0.0, 1.0, 20) ** 2):
+def table(cloud, at=AT, values=AT**2):
     ends = {"left": js.dirichlet(0.0), "right": js.neumann(0.0)}
     return js.solve(js.Problem(lambda u, x: js.laplacian(u)(x) - jnp.interp(x[0], at, values), ends), cloud)
 

@@ -16,6 +16,7 @@ import numpy as np
 from jsmitsm.runtime.errors import short
 
 Spacing = Callable[[np.ndarray], np.ndarray]
+SpacingLike = float | Callable[[np.ndarray], Any]
 
 # Particles per spacing^D of the densest even arrangement: hexagons in 2D; in 3D a little below the
 # 1.41 of a face-centred lattice, which relaxation from a random start does not find.

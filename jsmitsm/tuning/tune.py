@@ -7,9 +7,9 @@ only for the very numbers they were tuned to.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal, TypeAlias, Unpack
 
 import jax
 import numpy as np
@@ -18,17 +18,26 @@ from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.discretization.supports import default_kernel
 from jsmitsm.equation.problem import Problem
 from jsmitsm.particle.kernels import Kernel
+from jsmitsm.runtime.arrays import ArrayLike, ValueOrFunction
 from jsmitsm.runtime.errors import did_you_mean
 from jsmitsm.runtime.progress import bar
 from jsmitsm.runtime.tracers import is_traced
-from jsmitsm.solution.arguments import check, discretized
+from jsmitsm.solution.arguments import SolveOptions, check, discretized
 from jsmitsm.solution.solution import Solution
 from jsmitsm.solution.solve import solve
 from jsmitsm.tuning.descent import Descent
 from jsmitsm.tuning.objective import Objective
 from jsmitsm.tuning.parameter_maps import ParameterMap
 
-OPTIONS = ("method", "order", "stencils", "basis_terms", "formulation", "solver", "u0", "throw")
+
+class TuneOptions(SolveOptions, total=False):
+    """Options of :func:`jsmitsm.solve` for every solve of the search."""
+
+    u0: ValueOrFunction | None
+
+
+OPTIONS = tuple(TuneOptions.__annotations__)
+Parameter: TypeAlias = Literal["h", "d", "params"]
 
 
 @dataclass
@@ -64,13 +73,13 @@ def tune(
     cloud: Cloud,
     kernel: Kernel | None = None,
     *,
-    objective: str | Callable[[Solution], Any] = "estimate",
-    parameters: tuple[str, ...] = ("h", "d"),
+    objective: Literal["estimate"] | Callable[[Solution], Any] = "estimate",
+    parameters: Parameter | Sequence[Parameter] = ("h", "d"),
     optimizer: Any = None,
     steps: int = 50,
     progress: bool = True,
-    groups: Any = None,
-    **solve_options: Any,
+    groups: ArrayLike | None = None,
+    **solve_options: Unpack[TuneOptions],
 ) -> TuneResult:
     """Tune the parameters of a kernel by gradient descent.
 
@@ -114,7 +123,7 @@ def tune(
     >>> bool(found.history["objective"].min() < found.history["objective"][0] / 2)
     True
     """
-    options = {"method": "S", "order": 4, **solve_options}
+    options: dict[str, Any] = {"method": "S", "order": 4, **solve_options}
     _check_input(problem, cloud, kernel, objective, optimizer, steps, options)
     if kernel is None:
         kernel = _chosen(problem, cloud, options)

@@ -393,7 +393,7 @@ def an_attribute_of_the_function_itself(patch, path):
 @way
 def an_attribute_by_name(patch, path):
     box = Box()
-    return lambda: getattr(box, "k"), lambda: setattr(box, "k", 2.0)
+    return lambda: getattr(box, "k"), lambda: setattr(box, "k", 2.0)  # noqa: B009
 
 
 @way
@@ -405,13 +405,13 @@ def an_attribute_by_a_getter(patch, path):
 @way
 def an_attribute_in_a_text(patch, path):
     box = BOX
-    return lambda: float("{0.k}".format(box)), lambda: patch.setattr(box, "k", 2.0)
+    return lambda: float("{0.k}".format(box)), lambda: patch.setattr(box, "k", 2.0)  # noqa: UP030, UP032
 
 
 @way
 def an_attribute_of_a_module_in_a_text(patch, path):
     cfg = [module(patch, k=1.0)]
-    return lambda: float("{0[0].k}".format(cfg)), lambda: setattr(cfg[0], "k", 2.0)
+    return lambda: float("{0[0].k}".format(cfg)), lambda: setattr(cfg[0], "k", 2.0)  # noqa: UP030, UP032
 
 
 @way
