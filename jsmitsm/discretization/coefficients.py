@@ -110,7 +110,7 @@ def slot_series(rec: Recursion, slots: tuple[Slot, ...], taylor: Any, degree: in
 
 @partial(in_one_program, static=("rec", "slots", "degree"))
 def _derivatives(taylor: Any, rec: Recursion, slots: tuple[Slot, ...], degree: int) -> Any:
-    place = index_of(rec.dim, rec.order)
+    place = index_of(rec.dim, rec.reach)
     out = []
     for f, b in slots:
         up = [tuple(ti + bi for ti, bi in zip(t, b)) for t in multi_indices(rec.dim, degree)]

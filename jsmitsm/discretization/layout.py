@@ -90,7 +90,7 @@ class Discretization:
 
 def discretize(
     problem: Problem, cloud: Cloud, method: str, order: int, kernel: Kernel | None,
-    stencils: Stencils | None, basis_terms: int | None, sources: bool = True,
+    stencils: Stencils | None, basis_terms: int | None, sources: bool = True, depth: int | str = "auto",
 ) -> Discretization:  # fmt: skip
     """Trace the problem, lay out its recursion and conditions, and find neighbours.
 
@@ -98,7 +98,12 @@ def discretize(
     """
     traced = _traced(problem, cloud.dim)
     _check_operator(traced, problem, order)
+    sourced = sources or not traced.linear or traced.source != "zero"
     rec = recursion(cloud.dim, order, problem.fields, traced.slots, traced.pattern, traced.order)
+    flat = traced.constant and rec.scale_free
+    if depth == "auto":
+        depth = suited_depth(method, rec, flat, sourced)
+    rec = recursion(cloud.dim, order, problem.fields, traced.slots, traced.pattern, traced.order, int(depth))
     groups = group_conditions(problem, with_corners(problem, cloud), order, traced.order)
     held = np.zeros((len(cloud), problem.fields), bool)
     for group in groups:
@@ -110,8 +115,7 @@ def discretize(
     for group in groups:
         n_own[group.ids] = group.n_rows + len(group.held)
     scheme = _scheme(method, rec, traced, problem, cloud, basis_terms)
-    sourced = sources or not traced.linear or traced.source != "zero"
-    scheme = replace(scheme, **_conditions_layout(groups, rec), sourced=sourced)
+    scheme = replace(scheme, **_conditions_layout(groups, rec), sourced=sourced, flat=flat)
     if len(images.owner) and method in ("I", "II"):
         raise ValueError(f"method: {method} does not follow periodic conditions; use S, III or SSPH")
     if scheme.n_data and method in ("I", "II", "III"):
@@ -146,6 +150,19 @@ def discretize(
         disc.cut_off = cut_off(stencils, kernel, disc.points, disc.active)
     disc.classes = sorted_classes(disc, disc.active, stencils)
     return disc
+
+
+def suited_depth(method: str, rec: Recursion, flat: bool, sourced: bool) -> int:
+    """How many degrees the recursion should go beyond the fit.
+
+    Measured: two degrees have all of the gain where the solution is mild, four gain 2 to 10 times more where it
+    oscillates. I, II and III are the paper's. Where neither the operator nor a source has anything to say there, none.
+    """
+    if method != "S" or rec.order < 2 or (flat and not sourced):
+        return 0
+    if rec.order == 2 or (rec.dim == 3 and not flat):
+        return 2
+    return 4
 
 
 def _check_collocated(groups: list[Group], fields: int) -> None:

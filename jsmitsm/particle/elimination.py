@@ -1,4 +1,15 @@
-"""The recursion of one particle solved for its free coefficients: U = Q F + B c."""
+"""The recursion of one particle solved for its free coefficients: U = Q F + B c.
+
+The fit knows the coefficients up to the order. The recursion goes on beyond it: with the constraints parted into
+those that reach no further than the fit and the deeper ones,
+
+    M_ll u_l = F_l,      M_hl u_l + M_hh u_h = F_h,
+
+the tail u_h follows from u_l. It has more coefficients than equations; of all solutions the one of least Fischer
+norm sum a! u_a^2 is taken, u_h = E (F_h - M_hl u_l) with E = D (M_hh D)^+ and D = diag(1 / sqrt(a!)). That norm does
+not depend on the axes, and it keeps tails small where convection is strong, where degree by degree or axis by axis
+they grow without bound.
+"""
 
 from __future__ import annotations
 
@@ -10,9 +21,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm.particle.polynomials import whitening
-from jsmitsm.particle.recursion import Recursion, constraints, substitution
-from jsmitsm.particle.small_systems import null_space
-from jsmitsm.taylor.multi_indices import Slot
+from jsmitsm.particle.recursion import Recursion, constraints, split, substitution
+from jsmitsm.particle.small_systems import min_norm, null_space
+from jsmitsm.taylor.multi_indices import Slot, factorial, multi_indices
 
 
 @dataclass(frozen=True)
@@ -25,6 +36,8 @@ class Scheme:
     own : slots of the particle's own boundary conditions, and their number.
     data : slots of the conditions that neighbours contribute as data, and their number.
     sourced : whether the source's weights are wanted.
+    flat : whether the homogeneous local solutions end with the fit: those of a constant operator whose terms are all
+        of one order are sums of homogeneous polynomials.
     """
 
     method: str
@@ -36,6 +49,13 @@ class Scheme:
     data: tuple[Slot, ...] = ()
     n_data: int = 0
     sourced: bool = True
+    flat: bool = False
+
+    @property
+    def decay(self) -> float:
+        """Without a kernel the weight is exp(-(decay r / r_max)^2). Deeper polynomials are true farther out, and
+        measured best when the fit is drawn to the near ones."""
+        return 2.5 if self.rec.depth and self.rec.order >= 3 else 2.0
 
 
 class Elimination(NamedTuple):
@@ -47,9 +67,22 @@ class Elimination(NamedTuple):
     rows: Any  # (F, F K): the equations themselves, needed by collocation
 
 
-def _blocks(matrix: Any, fields: int) -> Any:
-    """The whitening applied to each field's block of columns."""
-    return matrix if fields == 1 else jnp.kron(jnp.eye(fields), matrix)
+@lru_cache(maxsize=64)
+def _whitening(rec: Recursion) -> np.ndarray:
+    """The whitening applied to each field's block of the fit's columns."""
+    blocks = [whitening(rec.dim, rec.order - (w if rec.depth else 0)) for w in rec.weights]
+    out = np.zeros((sum(map(len, blocks)),) * 2)
+    start = 0
+    for block in blocks:
+        out[start : start + len(block), start : start + len(block)] = block
+        start += len(block)
+    return out
+
+
+@lru_cache(maxsize=64)
+def _fischer(rec: Recursion) -> np.ndarray:
+    """1 / sqrt(a!) of every coefficient (F K,)."""
+    return np.tile([factorial(a) ** -0.5 for a in multi_indices(rec.dim, rec.reach)], rec.fields)
 
 
 def eliminate(scheme: Scheme, jac: Any, length: Any) -> Elimination:
@@ -60,16 +93,34 @@ def eliminate(scheme: Scheme, jac: Any, length: Any) -> Elimination:
     rec = scheme.rec
     matrix, lift = constraints(rec, jac, length)
     rows = matrix[np.array(rec.equation_rows)]
+    white = jnp.asarray(_whitening(rec))
     if scheme.method == "SSPH":
-        white = _blocks(jnp.asarray(whitening(rec.dim, rec.order)), rec.fields)
         return Elimination(white, jnp.zeros((white.shape[0], matrix.shape[0])), lift, rows)
+    low, _, first, _ = split(rec)
+    fitted = matrix if not rec.depth else matrix[first][:, low]
     if scheme.method == "S":
-        white = _blocks(jnp.asarray(whitening(rec.dim, rec.order)), rec.fields)
-        z, q = null_space(matrix @ white)
-        return Elimination(white @ z, white @ q, lift, rows)
-    order = np.concatenate([scheme.free, np.setdiff1d(_all_free(scheme), scheme.free)]).astype(int)
-    z, q = substitution(matrix, order, np.array(scheme.dependent))
-    return Elimination(z[:, : len(scheme.free)], q, lift, rows)
+        z, q = null_space(fitted @ white)
+        z, q = white @ z, white @ q
+    else:
+        order = np.concatenate([scheme.free, np.setdiff1d(_all_free(scheme), scheme.free)]).astype(int)
+        z, q = substitution(fitted, order, np.array(scheme.dependent))
+        z = z[:, : len(scheme.free)]
+    if rec.depth:
+        z, q = _deepened(rec, matrix, z, q)
+    return Elimination(z, q, lift, rows)
+
+
+def _deepened(rec: Recursion, matrix: Any, basis: Any, particular: Any) -> tuple[Any, Any]:
+    """Local solutions (F K, free) and (F K, rows) of all degrees, from those of the fit's."""
+    low, high, first, deeper = split(rec)
+    size = jnp.asarray(_fischer(rec)[high])
+    across, deep = matrix[deeper][:, low], matrix[deeper][:, high] * size
+    wanted = jnp.concatenate([-across @ basis, -across @ particular, jnp.eye(len(deeper))], axis=1)
+    tail = size[:, None] * min_norm(deep.T, wanted)
+    free, count = basis.shape[1], rec.fields * rec.size
+    whole = jnp.zeros((count, free), basis.dtype).at[low].set(basis).at[high].set(tail[:, :free])
+    source = jnp.zeros((count, rec.n_rows), basis.dtype).at[np.ix_(low, first)].set(particular)
+    return whole, source.at[np.ix_(high, np.concatenate([first, deeper]))].set(tail[:, free:])
 
 
 def eliminate_on_host(scheme: Scheme, jac: np.ndarray, length: float = 1.0) -> Elimination:
@@ -92,17 +143,36 @@ def _eliminated(scheme: Scheme, jac: np.ndarray, length: float) -> Elimination:
     rec = scheme.rec
     matrix, lift = constraints(rec, jac, length, np)
     rows = matrix[np.array(rec.equation_rows)]
-    white = np.kron(np.eye(rec.fields), whitening(rec.dim, rec.order))
+    white = _whitening(rec)
     if scheme.method == "SSPH":
         return Elimination(white, np.zeros((white.shape[0], len(matrix))), lift, rows)
+    low, _, first, _ = split(rec)
+    fitted = matrix[np.ix_(first, low)] if rec.depth else matrix
     if scheme.method == "S":
-        return Elimination(*_refined(matrix, white), lift, rows)
-    free, dependent = np.array(scheme.free), np.array(scheme.dependent, int)
-    basis, particular = np.zeros((rec.size, len(free))), np.zeros((rec.size, len(matrix)))
-    particular[dependent] = np.linalg.inv(matrix[:, dependent])
-    basis[free, np.arange(len(free))] = 1.0
-    basis[dependent] = -particular[dependent] @ matrix[:, free]
+        basis, particular = _refined(fitted, white)
+    else:
+        free, dependent = np.array(scheme.free), np.array(scheme.dependent, int)
+        basis, particular = np.zeros((fitted.shape[1], len(free))), np.zeros(fitted.T.shape)
+        particular[dependent] = np.linalg.inv(fitted[:, dependent])
+        basis[free, np.arange(len(free))] = 1.0
+        basis[dependent] = -particular[dependent] @ fitted[:, free]
+    if rec.depth:
+        basis, particular = _deepened_on_host(rec, matrix, basis, particular)
     return Elimination(basis, particular, lift, rows)
+
+
+def _deepened_on_host(
+    rec: Recursion, matrix: np.ndarray, basis: np.ndarray, particular: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    low, high, first, deeper = split(rec)
+    size = _fischer(rec)[high]
+    _, inverse = _refined(matrix[np.ix_(deeper, high)] * size, np.eye(len(high)))
+    extension, across = size[:, None] * inverse, matrix[np.ix_(deeper, low)]
+    whole, source = np.zeros((matrix.shape[1], basis.shape[1])), np.zeros(matrix.T.shape)
+    whole[low], source[np.ix_(low, first)] = basis, particular
+    whole[high], source[np.ix_(high, first)] = -extension @ (across @ basis), -extension @ (across @ particular)
+    source[np.ix_(high, deeper)] = extension
+    return whole, source
 
 
 def _refined(matrix: np.ndarray, white: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -122,4 +192,4 @@ def _refined(matrix: np.ndarray, white: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def _all_free(scheme: Scheme) -> np.ndarray:
-    return np.setdiff1d(np.arange(scheme.rec.size), scheme.dependent)
+    return np.setdiff1d(np.arange(len(split(scheme.rec)[0])), scheme.dependent)

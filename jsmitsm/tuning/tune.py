@@ -26,7 +26,7 @@ from jsmitsm.tuning.descent import Descent
 from jsmitsm.tuning.objective import Objective
 from jsmitsm.tuning.parameter_maps import ParameterMap
 
-OPTIONS = ("method", "order", "stencils", "basis_terms", "formulation", "solver", "u0", "throw")
+OPTIONS = ("method", "order", "depth", "stencils", "basis_terms", "formulation", "solver", "u0", "throw")
 
 
 @dataclass
@@ -151,7 +151,8 @@ def _check_input(problem, cloud, kernel, objective, optimizer, steps, options) -
         if name not in OPTIONS:
             raise ValueError(f"{name}: no argument of js.tune or js.solve; those of js.solve are {', '.join(OPTIONS)}")
     o = {"method": "S", "order": 4, "formulation": "auto", "solver": "auto", "stencils": None, **options}
-    check(problem, cloud, o["method"], o["order"], kernel, o["stencils"], o["formulation"], o["solver"])
+    check(problem, cloud, o["method"], o["order"], kernel, o["stencils"], o["formulation"], o["solver"],
+          depth=o.get("depth", "auto"))
     if is_traced(kernel, cloud, problem.params):
         raise ValueError("kernel, cloud, problem: traced by a JAX transform; js.tune runs on the host, call it outside")
     if objective != "estimate" and not callable(objective):
