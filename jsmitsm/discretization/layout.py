@@ -90,7 +90,7 @@ class Discretization:
 
 def discretize(
     problem: Problem, cloud: Cloud, method: str, order: int, kernel: Kernel | None,
-    stencils: Stencils | None, basis_terms: int | None, sources: bool = True, depth: int | str = "auto",
+    stencils: Stencils | None, basis_terms: int | None, sources: bool = True, depth: int | str = 0,
 ) -> Discretization:  # fmt: skip
     """Trace the problem, lay out its recursion and conditions, and find neighbours.
 

@@ -25,8 +25,7 @@ from jsmitsm.particle.recursion import Recursion, constraints, split, substituti
 from jsmitsm.particle.small_systems import min_norm, null_space
 from jsmitsm.taylor.multi_indices import Slot, factorial, multi_indices
 
-
-# The part of a deep equation's square that its ridge is.
+# The ridge of a deep equation, as a part of its square.
 RIDGE = 1e-6
 
 

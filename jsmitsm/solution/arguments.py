@@ -23,7 +23,7 @@ METHODS = ("I", "II", "III", "S", "SSPH")
 def discretized(
     problem: Problem, cloud: Cloud, method: str = "S", order: int = 4, kernel: Kernel | None = None,
     stencils: Stencils | None = None, basis_terms: int | None = None, formulation: str = "auto", solver: str = "auto",
-    depth: int | str = "auto",
+    depth: int | str = 0,
 ) -> Discretization:  # fmt: skip
     """Checked arguments, discretised."""
     check(problem, cloud, method, order, kernel, stencils, formulation, solver, depth=depth)
@@ -32,7 +32,7 @@ def discretized(
 
 def check(
     problem, cloud, method, order, kernel, stencils, formulation="auto", solver="auto", u0=None, throw=True,
-    depth="auto",
+    depth=0,
 ) -> None:
     """Arguments of :func:`solve` that can be judged before any work."""
     for value, kind, name in ((problem, Problem, "problem"), (cloud, Cloud, "cloud")):
@@ -63,7 +63,7 @@ def check(
     _check_depth(depth, method, order)
 
 
-def _check_depth(depth: Any, method: str, order: int) -> None:
+def _check_depth(depth: Any, method: str, order: Any) -> None:
     """Degrees beyond the order: "auto" or a whole number."""
     if isinstance(depth, str) and depth == "auto":
         return

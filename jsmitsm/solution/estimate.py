@@ -79,7 +79,8 @@ def _higher(fit: Fit, low: Discretization) -> tuple[Discretization, Numbers]:
             "error_estimate: the points are traced by a JAX transform, and the wider stencils it needs are found on "
             "the host; ask for it outside the transform"
         )
-    high = discretized(fit.problem, Cloud(np.asarray(host), low.cloud.groups, low.cloud.normals), "S", order, depth=low.rec.depth)
+    cloud = Cloud(np.asarray(host), low.cloud.groups, low.cloud.normals)
+    high = discretized(fit.problem, cloud, "S", order, depth=low.rec.depth)
     high.cloud = fit.cloud
     taylor = fit.taylor
     if taylor is not None:

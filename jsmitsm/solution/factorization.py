@@ -82,7 +82,8 @@ class Factorization:
         traced = is_traced(values)
         if not traced:
             run.nums, run.values = nums, np.asarray(values)
-        recipe = Recipe(disc.scheme.method, disc.rec.order, disc.basis_terms, run.formulation, problem.fields, disc.rec.depth)
+        rec = disc.rec
+        recipe = Recipe(disc.scheme.method, rec.order, disc.basis_terms, run.formulation, problem.fields, rec.depth)
         fit = Fit(problem, disc.cloud, disc.kernel, table(disc), None, recipe)
         fine = jnp.isfinite(values).all() if traced else good
         return Solution(values, disc.cloud, recipe, fit, fine, 1, run.stats(), report=None if traced else run)
@@ -104,7 +105,7 @@ def _same(x: Any, y: Any) -> bool:
 def factorize(
     problem: Problem, cloud: Cloud, *, method: str = "S", order: int = 4, kernel: Kernel | None = None,
     stencils: Stencils | None = None, basis_terms: int | None = None, formulation: str = "auto", solver: str = "auto",
-    depth: int | str = "auto",
+    depth: int | str = 0,
 ) -> Factorization:  # fmt: skip
     """Prepare a linear problem for many right-hand sides.
 

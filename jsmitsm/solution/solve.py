@@ -27,7 +27,7 @@ def solve(
     *,
     method: str = "S",
     order: int = 4,
-    depth: int | str = "auto",
+    depth: int | str = 0,
     kernel: Kernel | None = None,
     stencils: Stencils | None = None,
     basis_terms: int | None = None,
@@ -44,8 +44,9 @@ def solve(
         symmetric moment rows.
     order : total degree of the fit.
     depth : degrees by which the recursion goes beyond the order: the local polynomials have degree
-        order + depth, with no more free coefficients. "auto" is 4 in 1D and 2D (2 at order 2), in 3D 2, or 4 where
-        the operator is constant and of one order; for I, II, III 0, the paper's; SSPH has no recursion.
+        order + depth, with no more free coefficients. 0 is the paper's. "auto" is, for method S, 4 in 1D and 2D (2 at
+        order 2), in 3D 2, or 4 where the operator is constant and of one order; for I, II and III 0. SSPH has no
+        recursion to go deeper with.
     kernel : weights and supports; chosen from the cloud, the order and the method if not given.
     stencils : from :func:`jsmitsm.stencils`; needed where JAX traces ``h``, ``d`` or the points.
     basis_terms : keep only the first so many free coefficients (I, II, III).
