@@ -8,6 +8,9 @@ from typing import Any
 import jax
 import numpy as np
 
+from jsmitsm.runtime.arrays import ArrayLike, ValueOrFunction
+from jsmitsm.runtime.errors import refuse_masked
+
 
 @jax.tree_util.register_pytree_node_class
 class Condition:
@@ -50,7 +53,7 @@ class Condition:
         return f"{self.kind}({', '.join(shown + ([f'field={self.field}'] if self.field is not None else []))})"
 
 
-def dirichlet(value: Any, field: int | None = None) -> Condition:
+def dirichlet(value: ValueOrFunction, field: int | None = None) -> Condition:
     """u = value on a group.
 
     value : a scalar, an array over the group (n,), or a function of x (and of params, where the
@@ -67,7 +70,7 @@ def dirichlet(value: Any, field: int | None = None) -> Condition:
     return Condition("dirichlet", _field(field), value=_value(value, "value"))
 
 
-def neumann(value: Any, field: int | None = None) -> Condition:
+def neumann(value: ValueOrFunction, field: int | None = None) -> Condition:
     """n . grad u = value on a group; ``value`` and ``field`` as in :func:`dirichlet`.
 
     >>> import jsmitsm as js
@@ -77,7 +80,9 @@ def neumann(value: Any, field: int | None = None) -> Condition:
     return Condition("neumann", _field(field), value=_value(value, "value"))
 
 
-def robin(a: Any, b: Any, value: Any, field: int | None = None) -> Condition:
+def robin(
+    a: ValueOrFunction, b: ValueOrFunction, value: ValueOrFunction, field: int | None = None
+) -> Condition:
     """a u + b n . grad u = value on a group; each of the three, and ``field``, as in :func:`dirichlet`.
 
     Raises ValueError where ``a`` and ``b`` are both zero.
@@ -123,7 +128,7 @@ def periodic(first: str, second: str) -> Condition:
     return Condition("periodic", groups=(first, second))
 
 
-def fix(indices: Any, value: Any, field: int | None = None) -> Condition:
+def fix(indices: ArrayLike, value: ValueOrFunction, field: int | None = None) -> Condition:
     """Hold the particles ``indices`` (interior ones too) at ``value``; give it under any free key.
 
     ``value`` and ``field`` as in :func:`dirichlet`. Raises ValueError for numbers that are none, or given twice.
@@ -132,6 +137,7 @@ def fix(indices: Any, value: Any, field: int | None = None) -> Condition:
     >>> js.fix([12], 0.0)
     fix(indices=(12,), value=0.0)
     """
+    refuse_masked(indices, "indices")
     index = np.atleast_1d(np.asarray(indices))
     if index.ndim != 1 or index.dtype.kind not in "iu" or not index.size:
         raise ValueError(f"indices: expected particle numbers, got {indices!r}")
@@ -160,6 +166,7 @@ def _value(value: Any, name: str) -> Any:
     """A number, array or function; anything else is refused here, where the user wrote it."""
     if callable(value) or isinstance(value, jax.core.Tracer):
         return value
+    refuse_masked(value, name)
     try:
         array = np.asarray(value)
         if array.dtype.kind not in "fiu":

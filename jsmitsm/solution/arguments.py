@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal, TypeAlias, TypedDict, get_args
 
 import numpy as np
 
@@ -10,20 +10,40 @@ from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.cloud.neighbours import Stencils
 from jsmitsm.discretization.layout import Discretization, discretize
 from jsmitsm.equation.problem import Problem
-from jsmitsm.linear.linsolve import SOLVERS
+from jsmitsm.linear.linsolve import SOLVERS, Solver
 from jsmitsm.particle.kernels import Kernel
+from jsmitsm.runtime.errors import refuse_masked
 from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.taylor.multi_indices import HIGHEST
 
+Method: TypeAlias = Literal["I", "II", "III", "S", "SSPH"]
+"""What ``method`` may be, a type for annotations."""
+Formulation: TypeAlias = Literal["auto", "loo", "lsq"]
+"""What ``formulation`` may be, a type for annotations."""
+Depth: TypeAlias = int | Literal["auto"]
+"""What ``depth`` may be, a type for annotations."""
+METHODS, FORMULATIONS = get_args(Method), get_args(Formulation)
 # Beyond so many degrees round-off of the extension outweighs its gain.
 DEEPEST = 4
-METHODS = ("I", "II", "III", "S", "SSPH")
+
+
+class SolveOptions(TypedDict, total=False):
+    """Options of :func:`jsmitsm.solve` that others pass on to it."""
+
+    method: Method
+    order: int
+    depth: Depth
+    stencils: Stencils | None
+    basis_terms: int | None
+    formulation: Formulation
+    solver: Solver
+    throw: bool
 
 
 def discretized(
     problem: Problem, cloud: Cloud, method: str = "S", order: int = 4, kernel: Kernel | None = None,
     stencils: Stencils | None = None, basis_terms: int | None = None, formulation: str = "auto", solver: str = "auto",
-    depth: int | str = 0,
+    depth: Depth = 0,
 ) -> Discretization:  # fmt: skip
     """Checked arguments, discretised."""
     check(problem, cloud, method, order, kernel, stencils, formulation, solver, depth=depth)
@@ -45,7 +65,7 @@ def check(
     if stencils is not None and not isinstance(stencils, Stencils):
         raise ValueError(f"stencils: expected js.stencils(cloud, size=...), got {type(stencils).__name__}")
     for value, known, name in (
-        (method, METHODS, "method"), (formulation, ("auto", "loo", "lsq"), "formulation"), (solver, SOLVERS, "solver")
+        (method, METHODS, "method"), (formulation, FORMULATIONS, "formulation"), (solver, SOLVERS, "solver")
     ):  # fmt: skip
         if value not in known:
             raise ValueError(f"{name}: {value!r} is none of {', '.join(map(repr, known))}")
@@ -82,6 +102,7 @@ def _check_start(u0: Any, shape: tuple[int, int]) -> None:
     """A start for Newton's method: nothing, a function, or finite values of the right shape."""
     if u0 is None or callable(u0) or is_traced(u0):
         return
+    refuse_masked(u0, "u0")
     try:
         if np.iscomplexobj(u0):
             raise TypeError
