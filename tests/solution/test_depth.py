@@ -56,8 +56,9 @@ def test_polynomials_of_the_order_are_reproduced(dim, order, depth):
 
 @pytest.mark.parametrize(
     "operator, order, gain",
-    [(poisson, 4, 4), (poisson, 6, 15), (helmholtz, 4, 10), (helmholtz, 5, 10), (diffusion, 4, 10), (quasilinear, 4, 15)],
-)
+    [(poisson, 4, 4), (poisson, 6, 15), (helmholtz, 4, 10), (helmholtz, 5, 10), (diffusion, 4, 10),
+     (quasilinear, 4, 15)],
+)  # fmt: skip
 def test_solutions_that_oscillate_gain(operator, order, gain):
     """About half of the factors measured on other clouds; values and gradients alike."""
     shift = 1.5 if operator is quasilinear else 0.0
@@ -128,7 +129,7 @@ def test_the_tail_of_method_iii():
 
 
 def test_nothing_changes_where_nothing_is_asked_for():
-    plain, (none, error) = solved(poisson, wave)[0], solved(poisson, wave, depth=0)
+    plain, none = (solved(poisson, wave, **options)[0] for options in ({}, {"depth": 0}))
     assert np.array_equal(plain.u, none.u) and none.depth == 0 and none.stats["depth"] == 0
     deep = solved(poisson, wave, depth=2)[0]
     assert deep.stats["depth"] == deep.depth == 2 and "depth=2" in repr(deep)
