@@ -7,6 +7,7 @@ from jsmitsm.clouds import Cloud, box, interval, rectangle
 from jsmitsm.errors import SolveError
 from jsmitsm.estimate import Factorization, factorize
 from jsmitsm.kernels import Constant, CubicSpline, Gaussian, Kernel, SuperGaussian, Wendland
+from jsmitsm.marks import meant
 from jsmitsm.neighbours import Stencils, stencils
 from jsmitsm.operators import divergence, grad, hessian, laplacian, partial
 from jsmitsm.problem import Condition, Problem, condition, dirichlet, fix, free, neumann, periodic, robin
@@ -19,10 +20,10 @@ __version__ = "0.1.0"
 
 __all__ = [
     "Cloud", "Condition", "Constant", "CubicSpline", "Factorization", "Gaussian", "Kernel", "Problem", "Quality",
-    "Solution", "SolveError", "Stencils", "SuperGaussian", "TuneResult", "Wendland", "box", "condition", "continuation",
-    "dirichlet", "divergence", "factorize", "files", "fix", "free", "from_polygon", "from_sdf", "grad", "hessian",
-    "interval", "laplacian", "multi_indices", "neumann", "no_progress", "partial", "periodic", "plot", "quadrature",
-    "quality", "rectangle", "robin", "sdf", "show_versions", "solve", "stencils", "tune",
+    "Solution", "SolveError", "Stencils", "SuperGaussian", "TuneResult", "Wendland", "box", "condition",
+    "continuation", "dirichlet", "divergence", "factorize", "files", "fix", "free", "from_polygon", "from_sdf", "grad",
+    "hessian", "interval", "laplacian", "meant", "multi_indices", "neumann", "no_progress", "partial", "periodic",
+    "plot", "quadrature", "quality", "rectangle", "robin", "sdf", "show_versions", "solve", "stencils", "tune",
 ]  # fmt: skip
 
 # Imported when first used: they need more than solving does.

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from jsmitsm.boundary import Group, group_conditions, in_words
+from jsmitsm.branches import FIELD
 from jsmitsm.clouds import Cloud
 from jsmitsm.kernels import Constant, Kernel
 from jsmitsm.moments import Scheme
@@ -145,7 +146,23 @@ def discretize(
     if given_stencils and kernel is not None:
         disc.cut_off = cut_off(stencils, kernel, disc.points, disc.active)
     disc.classes = sorted_classes(disc, disc.active, stencils)
+    if traced.branches is not None and not traced.branches.depends & FIELD:
+        refuse_jumps(disc, problem)
     return disc
+
+
+def refuse_jumps(disc: Discretization, problem: Problem, slots: Any = None) -> None:
+    """Refuse a problem whose operator differentiates a jump inside of the cloud.
+
+    slots (S, N): the derivatives of the field that decide where the branches depend on them.
+    """
+    near = disc.stencils.indices
+    if slots is None:  # periodic images have no values of their own
+        found = disc.traced.jumps(disc.points, near, params=problem.params)
+    else:
+        found = disc.traced.jumps(disc.cloud.points, disc.images.owners(near), params=problem.params, slots=slots)
+    if found is not None:
+        raise ValueError(f"pde: {found}")
 
 
 def _check_collocated(groups: list[Group], fields: int) -> None:

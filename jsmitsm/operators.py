@@ -11,9 +11,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.ad_checkpoint import checkpoint_name
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching
 
+from jsmitsm.marks import ALONG, DIFFERENTIATED
 from jsmitsm.taylor import MultiIndex, Slot, add
 
 # d^a u_k at a point.  Its derivative is the next higher derivative, which is all that
@@ -429,9 +431,13 @@ def _array_valued(function: Any) -> Callable[[Any], Any]:
 def _along(function: Callable[[Any], Any], axis: int) -> Callable[[Any], Any]:
     """The derivative of a function of the point along one axis, by forward mode."""
 
+    def named(y: Any) -> Any:
+        return checkpoint_name(function(y), f"{DIFFERENTIATED}{axis}")
+
     def slope(y: Any) -> Any:
         direction = np.zeros(len(y), y.dtype)
         direction[axis] = 1
-        return jax.jvp(function, (y,), (direction,))[1]
+        with jax.named_scope(ALONG):
+            return jax.jvp(named, (y,), (direction,))[1]
 
     return slope

@@ -15,9 +15,11 @@ from jax.extend.core import Literal
 
 from jsmitsm import abstract
 from jsmitsm.abstract import EXTRAS, FIELD, JUMPS, POINT, Facts
+from jsmitsm.branches import Branches, branches
 from jsmitsm.eager import in_one_program
 from jsmitsm.jaxprs import EVERYTHING, NOTHING, levels
 from jsmitsm.jets import evaluate, plain
+from jsmitsm.jumps import jumps
 from jsmitsm.linearize import Record, record
 from jsmitsm.operators import local_field
 from jsmitsm.program import fingerprint, kept
@@ -41,7 +43,7 @@ class Traced:
     derivative, -1 if none.  ``linear``: no coefficient depends on the field.  ``constant``: linear,
     and no coefficient depends on x or the extras (on parameters it may).  ``source``: what a
     residual leaves at u = 0: "zero", "constant" or "variable" (in x or the extras).
-    ``uses_extras``: whether an extra reaches the residual.
+    ``uses_extras``: whether an extra reaches the residual.  ``branches``: those that it differentiates, if any.
     """
 
     dim: int
@@ -54,6 +56,7 @@ class Traced:
     constant: bool
     source: str
     uses_extras: bool
+    branches: Branches | None = field(repr=False)
     _record: Record = field(repr=False)
     _n_extras: int = field(repr=False)
     _params_tree: Any = field(repr=False)
@@ -82,6 +85,13 @@ class Traced:
         if self.source == "zero" and slots is None:
             return jac, None
         return jac, self._compute(inputs, degree, False, True)[1]
+
+    def jumps(self, points: Any, near: Any, *, params: Any = None, slots: Any = None) -> str | None:
+        """What jumps under a derivative, in words, see :mod:`jsmitsm.jumps`; None: nothing does."""
+        if self.branches is None:
+            return None
+        consts = self._record.consts[len(self._record.consts) - len(self._record.written.constvars) :]
+        return jumps(self.branches, points, near, params, consts, slots)
 
     def _inputs(self, points: Any, degree: int, extras: Sequence[Any], params: Any, slots: Any) -> _Inputs:
         """Check and bring in the order of the jaxpr."""
@@ -338,6 +348,7 @@ def _classified(r: Record, dim: int, fields: int, n_extras: int, params_tree: An
         constant=linear and not every & (POINT | EXTRAS),
         source=source,
         uses_extras=bool((every | _bits(facts[0])) & EXTRAS),
+        branches=branches(r.written, r.consts[len(r.consts) - len(r.written.constvars) :], n_extras),
         _record=r,
         _n_extras=n_extras,
         _params_tree=params_tree,
