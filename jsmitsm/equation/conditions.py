@@ -86,8 +86,8 @@ def group_conditions(problem: Problem, cloud: Cloud, order: int, orders: tuple[i
         stray = [n for n in given if n not in cloud.groups]
         raise ValueError(
             f"bcs: no condition for the boundary group(s) {missing}; the cloud has {names}"
-            + (f", but not {stray}. " if stray else ". ")
-            + "Give each a condition, js.free() where none belongs"
+            + (f", but not {stray}. " if stray else ". ") +
+            "Give each a condition, js.free() where none belongs"
         )
     seconds = {c.groups[1] for cs in given.values() for c in cs if c.kind == "periodic"}
     for name in seconds & set(given):
