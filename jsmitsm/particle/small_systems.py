@@ -55,6 +55,19 @@ def _null_space_jvp(primals, tangents):
     return (z, q), (dz, dq)
 
 
+def independent(matrix: Any, rank: int) -> Any:
+    """Which ``rank`` rows of a matrix (r, k) span it, the largest first, as rows of the unit matrix (rank, r)."""
+    rest = jax.lax.stop_gradient(matrix)
+    chosen = []
+    for _ in range(rank):
+        k = jnp.argmax(jnp.sum(rest**2, axis=1))
+        v = rest[k] / jnp.sqrt(jnp.maximum(jnp.sum(rest[k] ** 2), jnp.finfo(rest.dtype).tiny))
+        rest = rest - jnp.outer(rest @ v, v)
+        rest = jnp.where((jnp.arange(len(rest)) == k)[:, None], 0.0, rest)
+        chosen.append(jnp.arange(len(rest)) == k)
+    return jnp.stack(chosen).astype(matrix.dtype) if rank else jnp.zeros((0, len(matrix)), matrix.dtype)
+
+
 def _inverse_lower(lower: Any) -> Any:
     """The inverse of a lower triangular matrix by forward substitution; zero pivots give zero rows."""
     n = lower.shape[0]
