@@ -58,7 +58,7 @@ def numbers(disc: Discretization, problem: Problem, taylor: Any = None, everywhe
     own_ids, own, given = _own_numbers(disc, taylor)
     data, gamma = _data_numbers(disc, taylor)
     values = _filled(np.zeros(disc.held.shape), held)
-    return settled(disc, Numbers(ids, jac, source, own_ids, own, given, values, data, gamma))
+    return settled(disc, problem, Numbers(ids, jac, source, own_ids, own, given, values, data, gamma))
 
 
 def operator_numbers(disc: Discretization, problem: Problem, points: Any, taylor: Any) -> tuple[Any, Any]:

@@ -11,18 +11,24 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any
 
+import jax
 import numpy as np
 
 from jsmitsm.discretization.layout import Discretization, mean_spacing, split
+from jsmitsm.equation.problem import Problem
 from jsmitsm.particle.recursion import Recursion, constraints, row_lifts
-from jsmitsm.runtime.tracers import concrete
+from jsmitsm.runtime.tracers import any_number, concrete
 from jsmitsm.taylor.multi_indices import factorial, index_of
 
-# Leading coefficients below this part of all others, over a support, may lose a row of the recursion; a row below this
-# part of the equation's largest is empty.
-LEADING, EMPTY = 1e-6, 1e-12
-# What is left of a row of unit length after those before it: less is nothing but rounding.
-DEPENDENT = 1e-8
+# Leading coefficients below this part of all others, over a support, may lose a row of the recursion or imply a
+# condition; where so many do, as in a steep layer, only those below the smaller part are looked at.
+LEADING, TINY, MANY = 1e-2, 1e-6, 500
+# A row below this part of the equation's largest is empty.
+EMPTY = 1e-12
+# What is left of a row of unit length after those before it; less adds nothing that a cloud resolves: a bit beside an
+# axis a condition differs from what the equation says by a layer as thin as the distance, and rounding grows with every
+# row that is taken for another.
+DEPENDENT = 1e-2
 
 
 @dataclass
@@ -31,12 +37,12 @@ class Degenerate:
 
     implied : particles of which a condition was left out, since the equation says the same.
     empty : particles where, and around which, an equation says nothing.
-    conflicts : (particle, by how much two statements of it differ, in units of u).
+    conflicts : (particle, by how much two statements of it differ, in units of u, and which part of u that may be).
     """
 
     implied: np.ndarray
     empty: np.ndarray
-    conflicts: list[tuple[int, float]]
+    conflicts: list[tuple[int, float, float]]
 
 
 @dataclass
@@ -47,43 +53,71 @@ class _Found:
     kept: list[int]
     nothing: bool
     conflict: float
+    slack: float
 
 
-def candidates(disc: Discretization, jac: np.ndarray) -> np.ndarray:
-    """Which of the particles (n,) of jac (E, S, T, n) have leading coefficients near zero."""
+def candidates(disc: Discretization, jac: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Those of the particles (n,) of jac (E, S, T, n) whose leading coefficients are near zero, and how near."""
     rec, length = disc.rec, 2.0 * mean_spacing(disc)
     degree = [sum(t) for t in index_of(rec.dim, rec.degree)]
-    out = np.zeros(jac.shape[-1], bool)
+    least = np.full(jac.shape[-1], np.inf)
     for e, level in enumerate(rec.levels):
         powers = [level - sum(b) - rec.weights[f] for f, b in rec.slots]
         lead = np.max([np.abs(jac[e, s, 0]) for s, p in enumerate(powers) if p == 0], axis=0)
         near = [t for t, d in enumerate(degree[: jac.shape[2]]) if d <= 2]
         every = np.max([np.abs(jac[e, s, t]) * length ** (p + degree[t]) for s, p in enumerate(powers) for t in near],
                        axis=0)  # fmt: skip
-        out |= lead <= LEADING * every
-    return out
+        least = np.minimum(least, np.where(every > 0, lead / np.where(every > 0, every, 1.0), 0.0))
+    few = np.flatnonzero(least <= LEADING)
+    few = few if len(few) <= MANY else np.flatnonzero(least <= TINY)
+    return few, least[few]
 
 
-def settled(disc: Discretization, nums: Any) -> Any:
+def settled(disc: Discretization, problem: Problem, nums: Any) -> Any:
     """The numbers without conditions that the equation implies; ``disc`` learns how many rows count where."""
     disc.lost, disc.dropped, old = None, None, (disc.lost, disc.dropped)
-    jac, own, points, near = (concrete(x) for x in (nums.jac, nums.own, disc.points, disc.stencils.indices))
-    unseen = any(x is None for x in (jac, own, points, near))
-    if not unseen and disc.scheme.method == "S" and np.shape(jac)[-1] > 1:
-        jac = np.asarray(jac)
-        at = np.flatnonzero(candidates(disc, jac))
+    own, points, near = (concrete(x) for x in (nums.own, disc.points, disc.stencils.indices))
+    seen = own is not None and points is not None and near is not None
+    if seen and disc.scheme.method == "S" and np.shape(nums.jac)[-1] > 1:
+        jac = concrete(nums.jac)
+        jac = _in_general(disc, problem, nums.ids) if jac is None else np.asarray(jac)
+        at, least = candidates(disc, jac)
         if len(at):
-            nums = _examined(disc, nums, jac, np.asarray(own), np.asarray(points), at)
-    if any((a is None) != (b is None) or not np.array_equal(a, b) for a, b in zip(old, (disc.lost, disc.dropped))):
+            nums = _examined(disc, nums, jac, np.asarray(own), np.asarray(points), at, least)
+    if not all(map(_same, old, (disc.lost, disc.dropped))):
         disc.classes = [part for cls in disc.classes for part in split(disc, cls)]
     return nums
 
 
+def _same(a: np.ndarray | None, b: np.ndarray | None) -> bool:
+    return a is b if a is None or b is None else np.array_equal(a, b)
+
+
+def _in_general(disc: Discretization, problem: Problem, ids: np.ndarray) -> np.ndarray:
+    """The operator's coefficients where JAX only traces them: with any numbers for what is traced.
+
+    Which rows are empty, or repeat others, hangs on where x makes the coefficients vanish, but for special numbers.
+    """
+    traced, points = disc.traced, np.asarray(concrete(disc.cloud.points))[ids]
+    params = jax.tree.map(any_number, problem.params)
+    slots, terms = None, len(index_of(disc.rec.dim, disc.rec.degree))
+    if not traced.linear:
+        slots = np.random.default_rng(0).uniform(0.5, 1.5, (len(traced.slots), terms, len(points)))
+    return np.asarray(traced.with_any_numbers().coefficients(points, disc.rec.degree, params=params, slots=slots)[0])
+
+
 def _examined(
-    disc: Discretization, nums: Any, jac: np.ndarray, own: np.ndarray, points: np.ndarray, at: np.ndarray
+    disc: Discretization,
+    nums: Any,
+    jac: np.ndarray,
+    own: np.ndarray,
+    points: np.ndarray,
+    at: np.ndarray,
+    least: np.ndarray,
 ) -> Any:
     n, rec = len(disc.cloud), disc.rec
-    source, given = concrete(nums.source), concrete(nums.given)
+    known = concrete(nums.jac) is not None
+    source, given = (concrete(x) if known else None for x in (nums.source, nums.given))
     near, ids = np.asarray(concrete(disc.stencils.indices)), nums.ids
     found: dict[int, _Found] = {}
     scale = _scales(rec, jac, 2.0 * mean_spacing(disc))
@@ -106,7 +140,9 @@ def _examined(
     disc.lost, disc.dropped = lost, dropped
     share = np.where(near >= 0, nothing[disc.images.owners(near)], False).sum(axis=1) / (near >= 0).sum(axis=1)
     empty = np.flatnonzero(nothing[:n] & ((share > 0.5) | (disc.scheme.method == "SSPH")))
-    conflicts = [(i, one.conflict) for i, one in found.items() if one.conflict > 0]
+    # A little beside an axis, at a distance that no cloud resolves, data are those of the axis.
+    beside = dict(zip(ids[at].tolist(), least.tolist()))
+    conflicts = [(i, one.conflict, max(one.slack, beside[i])) for i, one in found.items() if one.conflict > 0]
     told = Degenerate(np.flatnonzero(dropped), empty, conflicts)
     return replace(nums, degenerate=told, **_first_kept(nums, {i: one.kept for i, one in found.items()}))
 
@@ -134,15 +170,18 @@ def _particle(
     full = size > EMPTY * largest
     matrix, lift = np.where(full[:, None], matrix, 0.0), np.where(full, lift, row_lifts(rec, length, np) / largest)
     right = np.zeros(len(lift)) if source is None else lift * source
-    chosen, span = _independent(matrix)
+    chosen, span, slack = _independent(matrix)
     conditions, scales = _functionals(disc, own, length)
     values = np.zeros(len(own)) if given is None else scales * given
     kept = []
     for k, row in enumerate(conditions):
         rest = row - span.T @ (span @ row)
-        if np.linalg.norm(rest) > DEPENDENT:
+        left = float(np.linalg.norm(rest))
+        if left > DEPENDENT:
             kept.append(k)
-            span = np.concatenate([span, rest[None] / np.linalg.norm(rest)])
+            span = np.concatenate([span, rest[None] / left])
+        else:
+            slack = max(slack, left)
     said = np.concatenate([matrix[chosen], conditions[kept]])
     solution = np.linalg.lstsq(said, np.concatenate([right[chosen], values[kept]]), rcond=None)[0]
     conflict = 0.0
@@ -151,11 +190,11 @@ def _particle(
     if source is not None and given is not None:
         conflict = max(conflict, float(np.abs(conditions @ solution - values).max(initial=0.0)))
     nothing = any(not full[equation == e].any() for e in range(len(rec.levels)))
-    return _Found(len(lift) - len(chosen), kept, nothing, conflict)
+    return _Found(len(lift) - len(chosen), kept, nothing, conflict, slack)
 
 
-def _independent(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rows (numbers) that span all, the largest first, and an orthonormal basis of what they span."""
+def _independent(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+    """Rows (numbers) that span all, the largest first, an orthonormal basis of it, and what it misses of the rest."""
     rest, chosen, span = matrix.copy(), [], np.zeros((0, matrix.shape[1]))
     for _ in range(len(matrix)):
         norms = np.linalg.norm(rest, axis=1)
@@ -169,7 +208,7 @@ def _independent(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         span = np.concatenate([span, v[None]])
         rest = rest - np.outer(rest @ v, v)
         rest[k] = 0.0
-    return np.array(chosen, int), span
+    return np.array(chosen, int), span, float(np.linalg.norm(rest, axis=1).max(initial=0.0))
 
 
 def _functionals(disc: Discretization, own: np.ndarray, length: float) -> tuple[np.ndarray, np.ndarray]:

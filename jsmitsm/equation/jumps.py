@@ -14,7 +14,7 @@ import jax
 import numpy as np
 
 from jsmitsm.equation.branches import FIELD, PARAMETER, TRACED, Branches, Differentiated
-from jsmitsm.runtime.tracers import concrete
+from jsmitsm.runtime.tracers import any_number, concrete
 from jsmitsm.taylor.jets import evaluate
 
 # A jump is more than this part of the value: beside a smooth function's change over 1e-14 of a spacing, and a root's.
@@ -32,7 +32,7 @@ def jumps(of: Branches, points: Any, near: Any, params: Any, consts: Sequence[An
     points (M, D); near (N, w) the neighbours of the first N; slots (S, M) the derivatives of the field in
     ``of.slots``, None where no outcome depends on them.
     """
-    leaves = [_stand_in(v) for v in jax.tree.leaves(params)]
+    leaves = [any_number(v) for v in jax.tree.leaves(params)]
     ready = all(concrete(x) is not None for x in (points, near, *(() if slots is None else (slots,))))
     if any(o.depends & TRACED for o in of.outcomes) or not ready or (
         of.depends & PARAMETER and any(concrete(v) is None for v in jax.tree.leaves(params))
@@ -42,18 +42,9 @@ def jumps(of: Branches, points: Any, near: Any, params: Any, consts: Sequence[An
             "inside of the cloud cannot be seen under jit. Solve without jit (derivatives alone do no harm), or mark "
             "the function with js.meant where it does not jump"
         )
-    here = _Sampled(of, np.asarray(concrete(points), float), leaves, [_stand_in(c) for c in consts],
+    here = _Sampled(of, np.asarray(concrete(points), float), leaves, [any_number(c) for c in consts],
                     None if slots is None else np.asarray(concrete(slots)))  # fmt: skip
     return here.jump(np.asarray(concrete(near)))
-
-
-def _stand_in(value: Any) -> np.ndarray:
-    """The number itself, or any for one that is only traced and decides no branch."""
-    known = concrete(value)
-    if known is not None:
-        return np.asarray(known)
-    some = np.random.default_rng(0).uniform(0.5, 1.5, np.shape(value))
-    return some.astype(value.dtype)
 
 
 class _Sampled:

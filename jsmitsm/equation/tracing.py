@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -22,7 +22,7 @@ from jsmitsm.equation.linearizing import Record, record
 from jsmitsm.equation.recording import recalled
 from jsmitsm.runtime.compiled import fingerprint, kept
 from jsmitsm.runtime.jaxprs import EVERYTHING, NOTHING, levels
-from jsmitsm.runtime.tracers import is_traced
+from jsmitsm.runtime.tracers import any_number, is_traced
 from jsmitsm.runtime.whole_program import in_one_program
 from jsmitsm.taylor.jets import evaluate, plain
 from jsmitsm.taylor.multi_indices import Slot, count
@@ -85,6 +85,10 @@ class Traced:
         if self.source == "zero" and slots is None:
             return jac, None
         return jac, self._compute(inputs, degree, False, True)[1]
+
+    def with_any_numbers(self) -> Traced:
+        """The same with some numbers for the constants that are only traced."""
+        return replace(self, _record=self._record._replace(consts=tuple(map(any_number, self._record.consts))))
 
     def jumps(self, points: Any, near: Any, *, params: Any = None, slots: Any = None) -> str | None:
         """What jumps under a derivative, in words, see :mod:`jsmitsm.jumps`; None: nothing does."""

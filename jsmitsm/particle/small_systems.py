@@ -24,7 +24,7 @@ def safe_root(x: Any) -> Any:
 
 @jax.custom_jvp
 def null_space(matrix: Any) -> tuple[Any, Any]:
-    """Orthonormal basis Z of the null space of C (r, k), and the pseudo-inverse Q of C (full rank).
+    """Orthonormal basis Z of the null space of C (r, k), and the pseudo-inverse Q of C (full rank, else NaN).
 
     Householder reflections in plain jnp, so that it batches without LAPACK.
     """
@@ -42,7 +42,9 @@ def null_space(matrix: Any) -> tuple[Any, Any]:
         return x - jnp.outer(v, v @ x), q - jnp.outer(q @ v, v)
 
     x, q = jax.lax.fori_loop(0, r, reflect, (matrix.T, jnp.eye(k, dtype=matrix.dtype)))
-    return q[:, r:], q[:, :r] @ _inverse_lower(x[:r].T)
+    # Of a row that repeats others rounding is left: what it would say of the solution is not to be used.
+    sound = jnp.all(jnp.abs(jnp.diagonal(x)) > 1e-13)
+    return jnp.where(sound, q[:, r:], jnp.nan), q[:, :r] @ _inverse_lower(x[:r].T)
 
 
 @null_space.defjvp

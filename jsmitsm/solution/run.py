@@ -138,7 +138,7 @@ class Run:
                 "condition does, as on an axis: the condition was left out."
             )
         spread = float(np.abs(values).max(initial=0.0))
-        bad = [i for i, off in found.conflicts if off > CONTRADICTION * spread]
+        bad = [i for i, off, slack in found.conflicts if off > (CONTRADICTION + 10.0 * slack) * spread]
         if bad and np.isfinite(spread):
             self.fail(
                 f"the equation at {len(bad)} particle(s), first {some(bad)}, where its leading coefficient vanishes, "
