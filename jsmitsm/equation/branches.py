@@ -97,10 +97,10 @@ def branching(jaxpr: Any) -> bool:
 
 def _branches(eqn: Any) -> bool:
     """Whether a number that varies becomes an outcome."""
-    inexact = [np.issubdtype(v.aval.dtype, np.inexact) for v in eqn.invars if hasattr(v.aval, "dtype")]
-    exact = [not np.issubdtype(v.aval.dtype, np.inexact) for v in eqn.outvars]
     name = eqn.primitive.name
-    return any(inexact) and (any(exact) or name in _STEPS or name in _JUMPS)
+    if not (name in _STEPS or name in _JUMPS or any(v.aval.dtype.kind in "biu" for v in eqn.outvars)):
+        return False
+    return any(v.aval.dtype.kind not in "biu" for v in eqn.invars)
 
 
 def branches(written: Any, consts: Sequence[Any], n_extras: int) -> Branches | None:
