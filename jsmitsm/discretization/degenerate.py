@@ -20,15 +20,14 @@ from jsmitsm.particle.recursion import Recursion, constraints, row_lifts
 from jsmitsm.runtime.tracers import any_number, concrete
 from jsmitsm.taylor.multi_indices import factorial, index_of
 
-# Leading coefficients below this part of all others, over a support, may lose a row of the recursion or imply a
-# condition; where so many do, as in a steep layer, only those below the smaller part are looked at.
-LEADING, TINY, MANY = 1e-2, 1e-6, 500
+# Leading coefficients below this part of all others, over a support, and of most of the cloud's, may lose a row of the
+# recursion or imply a condition; where so many do, only those below the smaller part are looked at.
+LEADING, MOST, TINY, MANY = 1e-2, 0.2, 1e-6, 500
 # A row below this part of the equation's largest is empty.
 EMPTY = 1e-12
-# What is left of a row of unit length after those before it; less adds nothing that a cloud resolves: a bit beside an
-# axis a condition differs from what the equation says by a layer as thin as the distance, and rounding grows with every
-# row that is taken for another.
-DEPENDENT = 1e-2
+# What is left of a row of unit length after those before it. Less adds nothing but rounding, which grows with every
+# row that is taken for another; a condition is left out only where the equation says the same.
+DEPENDENT, IMPLIED = 1e-2, 1e-4
 
 
 @dataclass
@@ -67,6 +66,8 @@ def candidates(disc: Discretization, jac: np.ndarray) -> tuple[np.ndarray, np.nd
         near = [t for t, d in enumerate(degree[: jac.shape[2]]) if d <= 2]
         every = np.max([np.abs(jac[e, s, t]) * length ** (p + degree[t]) for s, p in enumerate(powers) for t in near],
                        axis=0)  # fmt: skip
+        usual = np.quantile(lead, MOST)
+        every = np.minimum(every, usual) if usual > 0 else every
         least = np.minimum(least, np.where(every > 0, lead / np.where(every > 0, every, 1.0), 0.0))
     few = np.flatnonzero(least <= LEADING)
     few = few if len(few) <= MANY else np.flatnonzero(least <= TINY)
@@ -139,7 +140,7 @@ def _examined(
         return nums
     disc.lost, disc.dropped = lost, dropped
     share = np.where(near >= 0, nothing[disc.images.owners(near)], False).sum(axis=1) / (near >= 0).sum(axis=1)
-    empty = np.flatnonzero(nothing[:n] & ((share > 0.5) | (disc.scheme.method == "SSPH")))
+    empty = np.flatnonzero(nothing[:n] & (share > 0.5))
     # A little beside an axis, at a distance that no cloud resolves, data are those of the axis.
     beside = dict(zip(ids[at].tolist(), least.tolist()))
     conflicts = [(i, one.conflict, max(one.slack, beside[i])) for i, one in found.items() if one.conflict > 0]
@@ -177,7 +178,7 @@ def _particle(
     for k, row in enumerate(conditions):
         rest = row - span.T @ (span @ row)
         left = float(np.linalg.norm(rest))
-        if left > DEPENDENT:
+        if left > IMPLIED:
             kept.append(k)
             span = np.concatenate([span, rest[None] / left])
         else:
