@@ -21,12 +21,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm.particle.polynomials import whitening
-from jsmitsm.particle.recursion import Recursion, constraints, split, substitution
-from jsmitsm.particle.small_systems import min_norm, null_space
+from jsmitsm.particle.recursion import Recursion, constraints, row_lifts, split, substitution
+from jsmitsm.particle.small_systems import independent, min_norm, null_space
 from jsmitsm.taylor.multi_indices import Slot, factorial, multi_indices
 
 # The ridge of a deep equation, as a part of its square.
 RIDGE = 1e-6
+# The deep part of an equation below this part of the whole says nothing of the tail.
+FAINT = 1e-6
+
+# A row of the recursion below this part of its equation's largest holds nothing but rounding.
+SMALL = 1e-12
 
 
 @dataclass(frozen=True)
@@ -41,6 +46,7 @@ class Scheme:
     sourced : whether the source's weights are wanted.
     flat : whether the homogeneous local solutions end with the fit: those of a constant operator whose terms are all
         of one order are sums of homogeneous polynomials.
+    lost : rows of the recursion that add nothing to the others, where the equation degenerates.
     """
 
     method: str
@@ -52,6 +58,7 @@ class Scheme:
     data: tuple[Slot, ...] = ()
     n_data: int = 0
     sourced: bool = True
+    lost: int = 0
     flat: bool = False
 
     @property
@@ -102,7 +109,10 @@ def eliminate(scheme: Scheme, jac: Any, length: Any) -> Elimination:
     low, _, first, _ = split(rec)
     fitted = matrix if not rec.depth else matrix[first][:, low]
     if scheme.method == "S":
-        z, q = null_space(fitted @ white)
+        if scheme.lost:
+            z, q, lift = _of_lower_rank(scheme, fitted, lift, length, white)
+        else:
+            z, q = null_space(fitted @ white)
         z, q = white @ z, white @ q
     else:
         order = np.concatenate([scheme.free, np.setdiff1d(_all_free(scheme), scheme.free)]).astype(int)
@@ -130,8 +140,8 @@ def _deepened(scheme: Scheme, matrix: Any, basis: Any, particular: Any) -> tuple
 
 
 def _row_lengths(matrix: Any, xp: Any) -> Any:
-    length = xp.sqrt(xp.sum(matrix**2, axis=1))
-    return xp.where(length > 0, length, 1.0)
+    """The lengths of the deep parts of rows of unit length; where they are only rounding, none of it counts."""
+    return xp.maximum(xp.sqrt(xp.sum(matrix**2, axis=1)), FAINT)
 
 
 def _slack(scheme: Scheme) -> np.ndarray:
@@ -143,6 +153,22 @@ def _slack(scheme: Scheme) -> np.ndarray:
     """
     n = len(split(scheme.rec)[3])
     return np.zeros((n, 0)) if scheme.flat else np.sqrt(RIDGE) * np.eye(n)
+
+
+def _of_lower_rank(scheme: Scheme, fitted: Any, lift: Any, length: Any, white: Any) -> tuple[Any, Any, Any]:
+    """Null space, pseudo-inverse and factors where some rows add nothing: by those that do, the largest first."""
+    # Rows of unit length hide that rounding is all there is of one.
+    rec = scheme.rec
+    first = split(rec)[2]
+    size = row_lifts(rec, length) / lift
+    equation = np.array([e for e, _ in rec.row_index])
+    largest = jnp.stack([jnp.max(jnp.where(equation == e, size, 0.0)) for e in range(len(rec.levels))])[equation]
+    small = size < SMALL * largest
+    damped = jnp.where(small, size / jnp.where(largest > 0, largest, 1.0), 1.0)
+    wide = (damped[first][:, None] * fitted) @ white
+    chosen = independent(wide, len(first) - scheme.lost)
+    z, q = null_space(chosen @ wide)
+    return z, q @ chosen, damped * lift
 
 
 def eliminate_on_host(scheme: Scheme, jac: np.ndarray, length: float = 1.0) -> Elimination:
