@@ -9,6 +9,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from jsmitsm.discretization.degenerate import Degenerate, settled
 from jsmitsm.discretization.layout import Discretization, crowded
 from jsmitsm.equation.conditions import merged
 from jsmitsm.equation.problem import Problem
@@ -45,6 +46,7 @@ class Numbers:
     held: Any
     data: Any
     gamma: Any
+    degenerate: Degenerate | None = None  # what was found where the equation degenerates
 
 
 def numbers(disc: Discretization, problem: Problem, taylor: Any = None, everywhere: bool = False) -> Numbers:
@@ -60,7 +62,8 @@ def numbers(disc: Discretization, problem: Problem, taylor: Any = None, everywhe
     held = [((group.ids, k), value()) for group in disc.groups for k, value in group.held.items()]
     own_ids, own, given = _own_numbers(disc, taylor)
     data, gamma = _data_numbers(disc, taylor)
-    return Numbers(ids, jac, source, own_ids, own, given, _filled(np.zeros(disc.held.shape), held), data, gamma)
+    values = _filled(np.zeros(disc.held.shape), held)
+    return settled(disc, problem, Numbers(ids, jac, source, own_ids, own, given, values, data, gamma))
 
 
 def operator_numbers(disc: Discretization, problem: Problem, points: Any, taylor: Any) -> tuple[Any, Any]:
@@ -105,7 +108,8 @@ def _refuse_nonfinite(points: Any, *series: Any) -> None:
         raise ValueError(
             f"pde: NaN or infinity at {len(bad)} particle(s), first at x = {np.asarray(points)[bad[0]]}, in the "
             "coefficients, the source or their derivatives; "
-            + (_SINGLE if np.asarray(values).dtype == np.float32 else "they must be finite and smooth there")
+            + (_SINGLE if np.asarray(values).dtype == np.float32 else "they must be finite and smooth there: where a "
+               "term is divided by a coordinate (2 / r on an axis), multiply the equation by it")
         )
 
 
@@ -116,7 +120,7 @@ def slot_series(rec: Recursion, slots: tuple[Slot, ...], taylor: Any, degree: in
 
 @partial(in_one_program, static=("rec", "slots", "degree"))
 def _derivatives(taylor: Any, rec: Recursion, slots: tuple[Slot, ...], degree: int) -> Any:
-    place = index_of(rec.dim, rec.order)
+    place = index_of(rec.dim, rec.reach)
     out = []
     for f, b in slots:
         up = [tuple(ti + bi for ti, bi in zip(t, b)) for t in multi_indices(rec.dim, degree)]

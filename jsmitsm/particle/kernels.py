@@ -165,9 +165,9 @@ class Gaussian(_Named):
         return jnp.exp(-(r**2))
 
 
-def fitted(farthest: Any) -> Gaussian:
-    """What stands for a kernel where none is given: it has fallen to exp(-4) at the farthest neighbour."""
-    return Gaussian.tree_unflatten(None, (farthest / 2.0, 2.0, None))
+def fitted(farthest: Any, decay: float = 2.0) -> Gaussian:
+    """What stands for a kernel where none is given: it has fallen to exp(-decay^2) at the farthest neighbour."""
+    return Gaussian.tree_unflatten(None, (farthest / decay, decay, None))
 
 
 @jax.tree_util.register_pytree_node_class

@@ -20,7 +20,11 @@ Method: TypeAlias = Literal["I", "II", "III", "S", "SSPH"]
 """What ``method`` may be, a type for annotations."""
 Formulation: TypeAlias = Literal["auto", "loo", "lsq"]
 """What ``formulation`` may be, a type for annotations."""
+Depth: TypeAlias = int | Literal["auto"]
+"""What ``depth`` may be, a type for annotations."""
 METHODS, FORMULATIONS = get_args(Method), get_args(Formulation)
+# Beyond so many degrees round-off of the extension outweighs its gain.
+DEEPEST = 4
 
 
 class SolveOptions(TypedDict, total=False):
@@ -28,6 +32,7 @@ class SolveOptions(TypedDict, total=False):
 
     method: Method
     order: int
+    depth: Depth
     stencils: Stencils | None
     basis_terms: int | None
     formulation: Formulation
@@ -38,14 +43,16 @@ class SolveOptions(TypedDict, total=False):
 def discretized(
     problem: Problem, cloud: Cloud, method: str = "S", order: int = 4, kernel: Kernel | None = None,
     stencils: Stencils | None = None, basis_terms: int | None = None, formulation: str = "auto", solver: str = "auto",
+    depth: Depth = 0,
 ) -> Discretization:  # fmt: skip
     """Checked arguments, discretised."""
-    check(problem, cloud, method, order, kernel, stencils, formulation, solver)
-    return discretize(problem, cloud, method, order, kernel, stencils, basis_terms)
+    check(problem, cloud, method, order, kernel, stencils, formulation, solver, depth=depth)
+    return discretize(problem, cloud, method, order, kernel, stencils, basis_terms, depth=depth)
 
 
 def check(
-    problem, cloud, method, order, kernel, stencils, formulation="auto", solver="auto", u0=None, throw=True
+    problem, cloud, method, order, kernel, stencils, formulation="auto", solver="auto", u0=None, throw=True,
+    depth=0,
 ) -> None:
     """Arguments of :func:`solve` that can be judged before any work."""
     for value, kind, name in ((problem, Problem, "problem"), (cloud, Cloud, "cloud")):
@@ -72,6 +79,22 @@ def check(
     if isinstance(order, bool) or not isinstance(order, (int, np.integer)) or not 1 <= order <= HIGHEST:
         raise ValueError(
             f"order: expected a whole number from 1 to {HIGHEST}, the degree of the expansions, got {short(order)}"
+        )
+    _check_depth(depth, method, order)
+
+
+def _check_depth(depth: Any, method: str, order: Any) -> None:
+    """Degrees beyond the order: "auto" or a whole number."""
+    if isinstance(depth, str) and depth == "auto":
+        return
+    if isinstance(depth, (bool, np.bool_)) or not isinstance(depth, (int, np.integer)) or depth < 0:
+        raise ValueError(f'depth: expected "auto" or a whole number from 0, degrees beyond the order, got {depth!r}')
+    if depth and method == "SSPH":
+        raise ValueError(f"depth: SSPH has no recursion to take {depth} degrees further; use depth=0, or method=\"S\"")
+    if order + depth > HIGHEST + DEEPEST:
+        raise ValueError(
+            f"depth: order {order} and depth {depth} make polynomials of degree {order + depth}, and "
+            f"{HIGHEST + DEEPEST} is the highest; beyond depth {DEEPEST} nothing is gained"
         )
 
 

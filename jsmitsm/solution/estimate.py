@@ -41,9 +41,10 @@ def error_estimate(fit: Fit, values: Any) -> Any:
     defect = _per_value(high, *high_rows, high_nums, values)
     own = _per_value(low, classes, rows, nums, values)
     free = np.flatnonzero(~low.held.reshape(-1))
-    ratio = own[1].reshape(-1)[free] / defect[1].reshape(-1)[free]
-    xp = jnp if is_traced(ratio) else np
-    ratio = xp.where(xp.isfinite(ratio) & (ratio != 0), ratio, 1.0)
+    mine, theirs = own[1].reshape(-1)[free], defect[1].reshape(-1)[free]
+    xp = jnp if is_traced(mine, theirs) else np
+    known = (mine != 0) & (theirs != 0)
+    ratio = xp.where(known, mine / xp.where(known, theirs, 1.0), 1.0)
     data, r, c = matrix(low, classes, rows)
     x, _ = run.solved(data, r, c, ratio * defect[0].reshape(-1)[free], balanced=False)
     zero = np.zeros(low.held.size)
@@ -79,11 +80,12 @@ def _higher(fit: Fit, low: Discretization) -> tuple[Discretization, Numbers]:
             "error_estimate: the points are traced by a JAX transform, and the wider stencils it needs are found on "
             "the host; ask for it outside the transform"
         )
-    high = discretized(fit.problem, Cloud(np.asarray(host), low.cloud.groups, low.cloud.normals), "S", order)
+    cloud = Cloud(np.asarray(host), low.cloud.groups, low.cloud.normals)
+    high = discretized(fit.problem, cloud, "S", order, depth=low.rec.depth)
     high.cloud = fit.cloud
     taylor = fit.taylor
     if taylor is not None:
-        more = len(multi_indices(low.rec.dim, order)) - taylor.shape[2]
+        more = len(multi_indices(low.rec.dim, high.rec.reach)) - taylor.shape[2]
         taylor = (jnp if is_traced(taylor) else np).pad(taylor, ((0, 0), (0, 0), (0, more)))
     return high, numbers(high, fit.problem, taylor)
 

@@ -171,7 +171,8 @@ def _check_input(problem, cloud, kernel, objective, optimizer, steps, options) -
             raise ValueError(f"{name}: no argument of js.tune or js.solve; those of js.solve are {', '.join(OPTIONS)}"
                              + did_you_mean(name, [*OPTIONS, "objective", "optimizer", "steps"]))  # fmt: skip
     o = {"formulation": "auto", "solver": "auto", "stencils": None, **options}
-    check(problem, cloud, o["method"], o["order"], kernel, o["stencils"], o["formulation"], o["solver"])
+    check(problem, cloud, o["method"], o["order"], kernel, o["stencils"], o["formulation"], o["solver"],
+          depth=o.get("depth", 0))
     if is_traced(kernel, cloud, problem.params):
         raise ValueError("kernel, cloud, problem: traced by a JAX transform; js.tune runs on the host, call it outside")
     if objective != "estimate" and not callable(objective):
