@@ -8,7 +8,7 @@ Writes benchmarks/data/stability.json after every sweep, and benchmarks/data/sta
 goes on where a run was broken off.
 
 ``--random --seed N --cases M`` draws M cases instead (:mod:`benchmarks.random_cases`), prints the counts and writes
-benchmarks/data/random.json; ``--case K`` runs one of them. Some seconds a recipe of 40 cases, and a tenth of one a case.
+benchmarks/data/random.json; ``--case K`` runs one of them. Some seconds for every 40 cases, and a tenth of one a case.
 """
 
 import argparse
@@ -490,9 +490,9 @@ def by_subject(records, machine):
     needless = [r["error"] for r in records if r["kind"] == "flagged needlessly"]
     inexact = sum(error > 0.01 for error in needless)
     note = (
-        f"`python -m benchmarks.stability` on {machine['processor']}, JAX {machine['jax']}: every method, 1D to 3D, orders "
-        "1 to 10, float64 and float32. *Wrong* is an error above 10 %, or above 100 times that of the neighbouring "
-        "cases; *refused* cases raise an error that names the cause. Of those right, yet flagged, "
+        f"`python -m benchmarks.stability` on {machine['processor']}, JAX {machine['jax']}: every method, 1D to 3D, "
+        "orders 1 to 10, float64 and float32. *Wrong* is an error above 10 %, or above 100 times that of the "
+        "neighbouring cases; *refused* cases raise an error that names the cause. Of those right, yet flagged, "
         f"{inexact} have an error above 1 %."
     )
     columns = ["cases", "tried", "accurate", "refused", "wrong and flagged", "right, yet flagged", "silently wrong"]
@@ -551,7 +551,7 @@ def main():
     parser.add_argument("--cases", type=int, default=4000, help="how many random cases")
     parser.add_argument("--case", type=int, help="this random case alone")
     parser.add_argument("--jobs", type=int, default=2, help="processes for the random cases")
-    parser.add_argument("--scratch", default=".cache/random", help="records as they come; a broken run goes on from them")
+    parser.add_argument("--scratch", default=".cache/random", help="records as they come, from which a run goes on")
     parser.add_argument("--part", type=int, help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.random:

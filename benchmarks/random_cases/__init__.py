@@ -1,1 +1,1 @@
-"""Random boundary-value problems with known solutions: what they are made of, how they are drawn, how they are judged."""
+"""Random boundary-value problems with known solutions: their parts, how they are drawn, how they are judged."""

@@ -231,7 +231,9 @@ def _numbers(rng: np.random.Generator, cloud: js.Cloud, op: Operator, solution: 
     across = rng.normal(size=dim)
     fields = op.fields(dim)
     scales = [1.0] * fields if fields == 1 or rng.random() < 0.6 else list(rng.choice([1.0, 0.1, 10.0], fields))
-    drawn = [solutions.numbers(rng, "smooth" if solution == "laminate" else solution, points, gap, width * rng.choice([1.0, 1.0, 2.0])) for _ in range(fields)]
+    name = "smooth" if solution == "laminate" else solution
+    wide = lambda: width * rng.choice([1.0, 1.0, 2.0])
+    drawn = [solutions.numbers(rng, name, points, gap, wide()) for _ in range(fields)]
     for scale, p in zip(scales, drawn):
         p.update({name: np.float64(p[name] * scale) for name in ("size", "constant")}, slope=p["slope"] * scale)
     velocity = rng.uniform(0.3, 1.0, dim)

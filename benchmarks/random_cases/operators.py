@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache
 from typing import Any
 
 import jax.numpy as jnp
@@ -237,7 +237,7 @@ OPERATORS = {
 }
 
 
-@lru_cache(maxsize=None)
+@cache
 def residual(name: str, coefficient_name: str, exact: Callable[[Any, Any], Any]) -> Callable[[Any, Any, Any], Any]:
     """The pde(u, x, q) with the source that the solution needs."""
     operator = OPERATORS[name].function

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import lru_cache
+from functools import cache
 from typing import Any
 
 import jax
@@ -62,7 +62,7 @@ SOLUTIONS: dict[str, Callable[[Any, Any], Any]] = {
 }
 
 
-@lru_cache(maxsize=None)
+@cache
 def exact(name: str, fields: int) -> Callable[[Any, Any], Any]:
     """The solution (x, q), a scalar or (F,), from the numbers q["fields"]."""
     if name == "laminate":
@@ -73,7 +73,7 @@ def exact(name: str, fields: int) -> Callable[[Any, Any], Any]:
     return lambda x, q: jnp.stack([one(x, p) for p in q["fields"]])
 
 
-@lru_cache(maxsize=None)
+@cache
 def _compiled(name: str, fields: int, slopes: bool) -> Callable[[Any, Any], Any]:
     f = exact(name, fields)
     return jax.jit(jax.vmap(jax.jacfwd(f) if slopes else f, (0, None)))

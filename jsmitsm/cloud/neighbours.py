@@ -11,6 +11,8 @@ import numpy as np
 
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.particle.kernels import EDGE
+from jsmitsm.runtime.arrays import Array, ArrayLike
+from jsmitsm.runtime.errors import short
 from jsmitsm.runtime.interrupts import interruptible
 from jsmitsm.runtime.progress import bar
 from jsmitsm.runtime.threads import cores
@@ -41,11 +43,11 @@ class Stencils:
     Attributes
     ----------
     indices : (N, w) int32 array; the particle itself comes first, -1 fills the row.
-    radius : (N,) float array, the distance within which all particles are listed.
+    radius : (N,) float array, the distance within which all particles are listed; None where nothing needs it.
     """
 
-    indices: Any
-    radius: Any
+    indices: Array
+    radius: Array | None
 
     @property
     def width(self) -> int:
@@ -60,7 +62,7 @@ class Stencils:
 
 
 @bar("neighbours")
-def stencils(cloud: Cloud, *, size: int | None = None, radius: Any = None) -> Stencils:
+def stencils(cloud: Cloud, *, size: int | None = None, radius: ArrayLike | None = None) -> Stencils:
     """Find every particle's neighbours, once, on the host.
 
     Parameters
@@ -91,12 +93,12 @@ def stencils(cloud: Cloud, *, size: int | None = None, radius: Any = None) -> St
             "build stencils = js.stencils(cloud, size=...) before the transform and pass them in"
         )
     if (size is None) == (radius is None):
-        raise ValueError(f"stencils: give either size or radius, got size={size!r} and radius={radius!r}")
+        raise ValueError(f"stencils: give either size or radius, got size={short(size)} and radius={short(radius)}")
     points = np.asarray(cloud.points)
     if size is None:
         return within(points, radius)
     if isinstance(size, bool) or not isinstance(size, (int, np.integer)) or size < 2:
-        raise ValueError(f"size: expected a whole number of at least 2 (the particle itself counts), got {size!r}")
+        raise ValueError(f"size: expected a whole number of at least 2 (the particle itself counts), got {short(size)}")
     return nearest(points, int(size))
 
 
@@ -254,8 +256,9 @@ def within(points: np.ndarray, radius: Any, which: np.ndarray | None = None) -> 
     centres = points if which is None else points[which]
     try:
         radius = np.asarray(radius, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise ValueError(f"radius: expected a positive scalar or ({len(centres)},) array, got {radius!r}") from None
+    except (TypeError, ValueError, OverflowError):
+        came = short(radius)
+        raise ValueError(f"radius: expected a positive scalar or ({len(centres)},) array, got {came}") from None
     if radius.shape not in ((), (len(centres),)) or not (np.isfinite(radius) & (radius > 0)).all():
         came = f"shape {radius.shape}" if radius.ndim else f"{radius}"
         raise ValueError(f"radius: expected positive numbers, a scalar or ({len(centres)},), got {came}")

@@ -9,7 +9,9 @@ import numpy as np
 
 from jsmitsm.cloud import contour, filling, levelset, polygons, surface
 from jsmitsm.cloud.cloud import INTERIOR, Cloud
-from jsmitsm.cloud.filling import Spacing
+from jsmitsm.cloud.filling import Spacing, SpacingLike
+from jsmitsm.runtime.arrays import ArrayLike
+from jsmitsm.runtime.errors import short
 from jsmitsm.runtime.progress import bar
 
 # The cosine of 5 degrees: boundary particles whose normals differ by more may stand on two sides of a corner.
@@ -21,9 +23,9 @@ Predicate = Callable[[np.ndarray], Any]
 
 @bar("cloud")
 def from_sdf(
-    sdf: Callable,
-    bounds: tuple[Any, Any],
-    spacing: Any,
+    sdf: Callable[[Any], Any],
+    bounds: tuple[ArrayLike, ArrayLike],
+    spacing: SpacingLike,
     seed: int = 0,
     groups: Mapping[str, Predicate] | None = None,
 ) -> Cloud:
@@ -78,9 +80,9 @@ def from_sdf(
 
 @bar("cloud")
 def from_polygon(
-    vertices: Any,
-    spacing: Any,
-    holes: Sequence[Any] = (),
+    vertices: ArrayLike,
+    spacing: SpacingLike,
+    holes: Sequence[ArrayLike] = (),
     seed: int = 0,
     groups: Mapping[str, Predicate] | None = None,
 ) -> Cloud:
@@ -232,10 +234,10 @@ def _checked_bounds(bounds: Any) -> tuple[np.ndarray, np.ndarray]:
     try:
         lo, hi = (np.atleast_1d(np.asarray(corner, dtype=np.float64)) for corner in bounds)
         good = lo.shape == hi.shape and lo.ndim == 1 and len(lo) in (1, 2, 3)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         good = False
     if not good:
-        raise ValueError(f"bounds: expected (lo, hi) with D = 1, 2 or 3 numbers each, got {bounds!r}")
+        raise ValueError(f"bounds: expected (lo, hi) with D = 1, 2 or 3 numbers each, got {short(bounds)}")
     if not (np.isfinite(lo).all() and np.isfinite(hi).all() and (hi > lo).all()):
         raise ValueError(f"bounds: hi = {hi} must be greater than lo = {lo} along every axis, all finite")
     return lo, hi

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from jsmitsm.discretization.coefficients import Numbers
-from jsmitsm.discretization.layout import Discretization
+from jsmitsm.discretization.layout import Discretization, mean_spacing
 from jsmitsm.particle.recursion import Recursion
 from jsmitsm.runtime.tracers import concrete, is_traced
 
@@ -18,7 +18,7 @@ def prefers_least_squares(disc: Discretization, nums: Numbers) -> bool:
     """
     rec, jac = disc.rec, concrete(nums.jac)
     jac = None if jac is None else np.asarray(jac)  # where it only carries derivatives, no operation is recorded
-    orders = {rec.order - q for q in rec.degrees}
+    orders = set(rec.orders)
     if disc.scheme.method != "S" or rec.fields > 1:
         return False
     if orders == {1}:
@@ -43,7 +43,8 @@ def prefers_least_squares(disc: Discretization, nums: Numbers) -> bool:
     if not drift or concrete(disc.cloud.points) is None:
         return False
     speed = np.linalg.norm(jac[0, drift, 0], axis=0)
-    return bool(np.median(speed * mean_spacing(disc) / diffusion) > 2.0)
+    convective = speed * mean_spacing(disc) / np.where(diffusion > 0, diffusion, np.inf)
+    return bool(np.median(convective) > 2.0)
 
 
 def _timelike(rec: Recursion) -> bool:
@@ -58,7 +59,7 @@ def cell_peclet(disc: Discretization, nums: Numbers) -> float:
     rec = disc.rec
     drift = [s for s, (_, b) in enumerate(rec.slots) if sum(b) == 1]
     second = [s for s, (_, b) in enumerate(rec.slots) if sum(b) == 2]
-    orders = {rec.order - q for q in rec.degrees}
+    orders = set(rec.orders)
     if rec.fields > 1 or orders != {2} or not drift or not second or is_traced(nums.jac, disc.cloud.points):
         return 0.0
     jac = np.asarray(nums.jac)[0, :, 0]
@@ -66,16 +67,9 @@ def cell_peclet(disc: Discretization, nums: Numbers) -> float:
     return float(np.median(speed * mean_spacing(disc) / np.where(diffusion > 0, diffusion, np.inf)))
 
 
-def mean_spacing(disc: Discretization) -> float:
-    """The edge of the cube that each particle has for itself."""
-    points = np.asarray(concrete(disc.cloud.points))
-    return float((np.prod(np.ptp(points, axis=0)) / len(points)) ** (1.0 / disc.rec.dim))
-
-
 def usual_condition(disc: Discretization) -> float:
     """Of the order of the condition of a regular system: n^(m/D) for an operator of order m."""
-    order = max(disc.rec.order - q for q in disc.rec.degrees)
-    return float(len(disc.cloud) ** (order / disc.rec.dim))
+    return float(len(disc.cloud) ** (max(disc.rec.orders) / disc.rec.dim))
 
 
 def wave_number(disc: Discretization, nums: Numbers) -> float:
@@ -83,7 +77,7 @@ def wave_number(disc: Discretization, nums: Numbers) -> float:
     rec = disc.rec
     zero = [s for s, (_, b) in enumerate(rec.slots) if sum(b) == 0]
     pure = [s for s, (_, b) in enumerate(rec.slots) if sum(b) == 2 and max(b) == 2]
-    orders = {rec.order - q for q in rec.degrees}
+    orders = set(rec.orders)
     if rec.fields > 1 or orders != {2} or not zero or not pure or is_traced(nums.jac, disc.cloud.points):
         return 0.0
     jac = np.asarray(nums.jac)[0, :, 0]

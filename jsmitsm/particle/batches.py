@@ -1,7 +1,6 @@
-"""The rows of all particles, and the global system they make.
+"""What is written for one particle, mapped over many: their rows and their Taylor coefficients.
 
-The per-particle moment systems are vmapped in blocks that stay in cache; the sparsity pattern
-is fixed by the stencils and known before.
+The moment systems are vmapped in blocks that stay in cache.
 """
 
 from __future__ import annotations
@@ -228,7 +227,7 @@ def _without_empty(tree: Any) -> Any:
 
 def _prepared(scheme, points, kernel, i, near_ids, operands: Operands, jac, own):
     """The support, elimination and conditions of one particle."""
-    near = moments.support(points, i, near_ids, kernel)
+    near = moments.support(points, i, near_ids, kernel, scheme.decay)
     if operands.shared is None:
         solution = eliminate(scheme, jac, near.length)
     elif operands.lengths is not None:

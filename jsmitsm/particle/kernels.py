@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jsmitsm.runtime.arrays import Array, ArrayLike
+from jsmitsm.runtime.errors import did_you_mean, in_words, short
+from jsmitsm.runtime.snapshot import ScalarFunction, snapshot
 from jsmitsm.runtime.tracers import is_traced
 
 # A particle that sits on the edge of a support belongs to it; rounding must not decide that.
@@ -44,7 +47,7 @@ class Kernel:
     Kernel(h=0.2, d=2)
     """
 
-    def __init__(self, profile: Callable[..., Any], h: Any, d: Any, params: Any = None):
+    def __init__(self, profile: Callable[..., Any], h: ArrayLike, d: ArrayLike, params: Any = None):
         if not callable(profile):
             raise ValueError(
                 f"profile: expected a function of the scaled distance r, got {type(profile).__name__}; "
@@ -55,32 +58,48 @@ class Kernel:
         self._set(h, d)
         _check_profile(self)
 
-    def _set(self, h: Any, d: Any) -> None:
-        self.h, self.d = _checked(h, "h", (0, 1)), _checked(d, "d", (0,))
+    def _set(self, h: ArrayLike, d: ArrayLike) -> None:
+        self.h: float | Array = _checked(h, "h", (0, 1))
+        self.d: float | jax.Array = _checked(d, "d", (0,))
 
-    def profile(self, r: Any) -> Any:
+    def profile(self, r: Any) -> jax.Array:
         """The weight at the scaled distance ``r``, before the support cuts it off."""
         return self._profile(r) if self.params is None else self._profile(r, self.params)
 
-    def weight(self, r: Any) -> Any:
+    def weight(self, r: Any) -> jax.Array:
         """The weight at the scaled distance ``r`` (any shape), zero outside the support."""
         return jnp.where(r <= self.d * EDGE, self.profile(r), 0.0)
 
+    def recorded(self) -> Kernel:
+        """The same kernel with the user's profile as it is now: compiled programs are kept under what it computes."""
+        if self._profile is None or isinstance(self._profile, ScalarFunction):
+            return self
+        profile = ScalarFunction(self._profile, *(() if self.params is None else (self.params,)))
+        return self if profile.traced else self._with(profile)
+
+    def as_written(self) -> Kernel:
+        """The same kernel with the profile that the user wrote."""
+        return self._with(self._profile.function) if isinstance(self._profile, ScalarFunction) else self
+
+    def _with(self, profile: Callable[..., Any]) -> Kernel:
+        return type(self).tree_unflatten(profile, (self.h, self.d, self.params))
+
     @property
-    def length(self) -> Any:
+    def length(self) -> float | Array:
         """The length by which offsets are divided, of the size of the support: a scalar or (N,), like ``h``."""
         xp = jnp if is_traced(self.h, self.d) else np
         return self.h * xp.minimum(self.d, 2.0)
 
     def at(self, i: Any) -> Kernel:
         """The kernel of particle ``i``: its own smoothing length where there is one per particle."""
-        return self.replace(h=self.h[i]) if jnp.ndim(self.h) else self
+        return self.replace(h=cast(Array, self.h)[i]) if jnp.ndim(self.h) else self
 
     def replace(self, **changes: Any) -> Kernel:
         """The same kernel with other ``changes``: ``h``, ``d`` or ``params``; ValueError for other names."""
         unknown = sorted(set(changes) - {"h", "d", "params"})
         if unknown:
-            raise ValueError(f"{unknown[0]}: no parameter of {type(self).__name__}; it has 'h', 'd' and 'params'")
+            raise ValueError(f"{unknown[0]}: no parameter of {type(self).__name__}; it has 'h', 'd' and 'params'"
+                             + did_you_mean(unknown[0], ("h", "d", "params")))  # fmt: skip
         _, aux = self.tree_flatten()
         for name, dims in (("h", (0, 1)), ("d", (0,))):
             if name in changes:
@@ -105,7 +124,7 @@ class Kernel:
 class _Named(Kernel):
     """A kernel with a profile of its own: needs only h and d."""
 
-    def __init__(self, h: Any, d: Any):
+    def __init__(self, h: ArrayLike, d: ArrayLike):
         self._profile = None  # type: ignore[assignment]  # the class has its own
         self.params = None
         self._set(h, d)
@@ -123,10 +142,10 @@ class SuperGaussian(_Named):
     4.0
     """
 
-    def profile(self, r: Any) -> Any:
+    def profile(self, r: Any) -> jax.Array:
         return (self.d**2 - r**2) * jnp.exp(-(r**2))
 
-    def normalization(self, dim: int) -> Any:
+    def normalization(self, dim: int) -> float | Array:
         """The constant G / (h sqrt(pi))^D of eq. (30), ``dim`` = D; ValueError unless that is 1, 2 or 3."""
         if dim not in (1, 2, 3):
             raise ValueError(f"dim: expected 1, 2 or 3 dimensions, got {dim!r}")
@@ -142,13 +161,13 @@ class Gaussian(_Named):
     1.0
     """
 
-    def profile(self, r: Any) -> Any:
+    def profile(self, r: Any) -> jax.Array:
         return jnp.exp(-(r**2))
 
 
-def fitted(farthest: Any) -> Gaussian:
-    """What stands for a kernel where none is given: it has fallen to exp(-4) at the farthest neighbour."""
-    return Gaussian.tree_unflatten(None, (farthest / 2.0, 2.0, None))
+def fitted(farthest: Any, decay: float = 2.0) -> Gaussian:
+    """What stands for a kernel where none is given: it has fallen to exp(-decay^2) at the farthest neighbour."""
+    return Gaussian.tree_unflatten(None, (farthest / decay, decay, None))
 
 
 @jax.tree_util.register_pytree_node_class
@@ -162,7 +181,7 @@ class Wendland(_Named):
     0.0
     """
 
-    def profile(self, r: Any) -> Any:
+    def profile(self, r: Any) -> jax.Array:
         q = r / self.d
         return (1 - q) ** 6 * (35 * q**2 + 18 * q + 3) / 3
 
@@ -179,7 +198,7 @@ class CubicSpline(_Named):
     0.25
     """
 
-    def profile(self, r: Any) -> Any:
+    def profile(self, r: Any) -> jax.Array:
         q = r / self.d
         return jnp.where(q <= 0.5, 1 - 6 * q**2 + 6 * q**3, 2 * (1 - q) ** 3)
 
@@ -193,7 +212,7 @@ class Constant(_Named):
     1.0
     """
 
-    def profile(self, r: Any) -> Any:
+    def profile(self, r: Any) -> jax.Array:
         return jnp.ones_like(r)
 
 
@@ -205,23 +224,25 @@ def _checked(value: Any, name: str, dims: tuple[int, ...]) -> Any:
         array = np.asarray(value)
         if array.dtype.kind not in "fiu":
             raise TypeError
-    except (TypeError, ValueError):
-        raise ValueError(f"{name}: expected a positive number, got {value!r}") from None
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError(f"{name}: expected a positive number, got {short(value)}") from None
     if array.ndim not in dims or not array.size:
         kinds = "a scalar or an (N,) array" if 1 in dims else "a scalar"
         raise ValueError(f"{name}: expected {kinds}, got an array of shape {array.shape}")
     if not (np.isfinite(array) & (array > 0)).all():
         raise ValueError(f"{name}: expected positive finite values, got {_short(array)}; {name} scales the support")
-    return float(array) if array.ndim == 0 and not isinstance(value, jax.Array) else value
+    if isinstance(value, jax.Array):
+        return value
+    return float(array) if array.ndim == 0 else array
 
 
 def _check_profile(kernel: Kernel) -> None:
     """Call a user's profile once without numbers: its signature and shape come to light."""
     said = "profile: expected a jax.numpy function of the scaled distance r (and of params, where given)"
     try:
-        shape = np.shape(jax.eval_shape(kernel.profile, jax.ShapeDtypeStruct((), jnp.result_type(float))))
+        shape = np.shape(snapshot(kernel.profile, jax.ShapeDtypeStruct((), jnp.result_type(float)))[1])
     except Exception as error:
-        raise ValueError(f"{said}, but calling it failed: {error}") from error
+        raise ValueError(f"{said}, but calling it failed: {in_words(error)}") from error
     if shape != ():
         raise ValueError(f"{said} that returns a scalar for a scalar, got shape {shape}")
 

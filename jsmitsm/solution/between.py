@@ -57,7 +57,7 @@ def unresolved(disc: Discretization, nums: Numbers, problem: Problem, values: An
 def _mean(disc: Discretization, problem: Problem, cls: Class, points: np.ndarray, fitted: np.ndarray) -> np.ndarray:
     """The mean residual (E, n) around every particle of a class, whose own share of it is zero."""
     near = np.asarray(cls.neighbours)[:, 1 : 1 + 2 * disc.rec.dim]
-    total, count = np.zeros((len(disc.rec.degrees), len(cls.ids))), np.ones(len(cls.ids))
+    total, count = np.zeros((len(disc.rec.orders), len(cls.ids))), np.ones(len(cls.ids))
     for k in range(near.shape[1]):
         there = near[:, k] >= 0
         offset = 0.5 * (points[np.where(there, near[:, k], cls.ids)] - points[cls.ids])
@@ -70,10 +70,10 @@ def _mean(disc: Discretization, problem: Problem, cls: Class, points: np.ndarray
 def _residual(disc: Discretization, problem: Problem, at: np.ndarray, offset: np.ndarray, u: np.ndarray) -> np.ndarray:
     """The residual (E, n) of polynomials u (n, F, K) at their centres plus ``offset``."""
     rec, traced = disc.rec, disc.traced
-    powers = np.stack([np.prod(offset ** np.array(a), axis=1) for a in multi_indices(rec.dim, rec.order)], axis=1)
+    powers = np.stack([np.prod(offset ** np.array(a), axis=1) for a in multi_indices(rec.dim, rec.reach)], axis=1)
     slots = []
     for f, b in traced.slots:
-        lower, factor = derivative_table(rec.dim, rec.order, b)
+        lower, factor = derivative_table(rec.dim, rec.reach, b)
         slots.append(np.einsum("nk,nk->n", u[:, f], powers[:, lower] * factor))
     value = np.stack(slots)[:, None]
     if not traced.linear:

@@ -47,7 +47,7 @@ def error_estimate(fit: Fit, values: Any) -> Any:
     defect = _per_value(high, *high_rows, high_nums, values)
     own = _per_value(low, classes, rows, nums, values)
     free = np.flatnonzero(~low.held.reshape(-1))
-    ratio = _one_scale(own[1] / defect[1], low)
+    ratio = _one_scale(own[1], defect[1], low)
     trust = _trust(high, *high_rows)
     rest = (ratio * trust * defect[0]).reshape(-1)[free]
     data, r, c = matrix(low, classes, rows)
@@ -58,13 +58,14 @@ def error_estimate(fit: Fit, values: Any) -> Any:
     return error[:, 0] if low.rec.fields == 1 else error
 
 
-def _one_scale(ratio: Any, disc: Discretization) -> Any:
-    """The ratios (N, F) of the weights that the source has in the rows of the two orders, without outliers.
+def _one_scale(mine: Any, theirs: Any, disc: Discretization) -> Any:
+    """The ratios (N, F) of the weights that the source has in the rows of both orders, without outliers.
 
     A row with a condition of its own hardly hangs on the source, whose weights may vanish there in one of the two.
     """
-    xp = jnp if is_traced(ratio) else np
-    ratio = xp.where(xp.isfinite(ratio) & (ratio != 0), ratio, 1.0)
+    xp = jnp if is_traced(mine, theirs) else np
+    known = (mine != 0) & (theirs != 0)
+    ratio = xp.where(known, mine / xp.where(known, theirs, 1.0), 1.0)
     typical = xp.ones(ratio.shape)
     for some in (disc.n_own == 0, disc.n_own > 0):
         for f in range(ratio.shape[1]):
@@ -118,11 +119,12 @@ def _higher(fit: Fit, low: Discretization) -> tuple[Discretization, Numbers]:
             "error_estimate: the points are traced by a JAX transform, and the wider stencils it needs are found on "
             "the host; ask for it outside the transform"
         )
-    high = discretized(fit.problem, Cloud(np.asarray(host), low.cloud.groups, low.cloud.normals), "S", order)
+    cloud = Cloud(np.asarray(host), low.cloud.groups, low.cloud.normals)
+    high = discretized(fit.problem, cloud, "S", order, depth=low.rec.depth)
     high.cloud = fit.cloud
     taylor = fit.taylor
     if taylor is not None:
-        more = len(multi_indices(low.rec.dim, order)) - taylor.shape[2]
+        more = len(multi_indices(low.rec.dim, high.rec.reach)) - taylor.shape[2]
         taylor = (jnp if is_traced(taylor) else np).pad(taylor, ((0, 0), (0, 0), (0, more)))
     return high, numbers(high, fit.problem, taylor)
 

@@ -104,8 +104,7 @@ def _cleared(run: Any, found: dict[str, float], doubts: list[str]) -> bool:
     disc = run.disc
     if doubts or run.formulation == "lsq" or not disc.linear or disc.rec.fields > 1:
         return False
-    order = max(disc.rec.order - q for q in disc.rec.degrees)
-    if order > 2 and "source" not in found:  # nothing was measured but the roughness
+    if max(disc.rec.orders) > 2 and "source" not in found:  # nothing was measured but the roughness
         return False
     limits = {**CLEAR, "wave": CLEAR_WAVE * PHASE[disc.rec.order > 3]}
     return all(found.get(name, 0.0) <= limit for name, limit in limits.items())

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import time
-from typing import Any
 
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.cloud.neighbours import Stencils
 from jsmitsm.discretization.coefficients import numbers
 from jsmitsm.discretization.layout import discretize, table
 from jsmitsm.equation.problem import Problem
+from jsmitsm.linear.linsolve import Solver
 from jsmitsm.particle.kernels import Kernel
+from jsmitsm.runtime.arrays import ValueOrFunction
 from jsmitsm.runtime.progress import bar
 from jsmitsm.runtime.tracers import is_traced
-from jsmitsm.solution.arguments import check
+from jsmitsm.solution.arguments import Depth, Formulation, Method, check
 from jsmitsm.solution.fit import Fit, Recipe
 from jsmitsm.solution.newton import newton
 from jsmitsm.solution.run import Run
@@ -25,14 +26,15 @@ def solve(
     problem: Problem,
     cloud: Cloud,
     *,
-    method: str = "S",
+    method: Method = "S",
     order: int = 4,
+    depth: Depth = 0,
     kernel: Kernel | None = None,
     stencils: Stencils | None = None,
     basis_terms: int | None = None,
-    formulation: str = "auto",
-    solver: str = "auto",
-    u0: Any = None,
+    formulation: Formulation = "auto",
+    solver: Solver = "auto",
+    u0: ValueOrFunction | None = None,
     throw: bool = True,
 ) -> Solution:
     """Solve ``problem`` on ``cloud``.
@@ -41,7 +43,11 @@ def solve(
     ----------
     method : "I", "II", "III" (SMITSM, Karamanli 2015), "SSPH", or "S", the recursion with
         symmetric moment rows.
-    order : total degree of the local Taylor expansions.
+    order : total degree of the fit.
+    depth : degrees by which the recursion goes beyond the order: the local polynomials have degree
+        order + depth, with no more free coefficients. 0 is the paper's. "auto" is, for method S, 4 in 1D and 2D (2 at
+        order 2), in 3D 2, or 4 where the operator is constant and of one order; for I, II and III 0. SSPH has no
+        recursion to go deeper with.
     kernel : weights and supports; chosen from the cloud, the order and the method if not given.
     stencils : from :func:`jsmitsm.stencils`; needed where JAX traces ``h``, ``d`` or the points.
     basis_terms : keep only the first so many free coefficients (I, II, III).
@@ -74,8 +80,8 @@ def solve(
     True
     """
     start = time.perf_counter()
-    check(problem, cloud, method, order, kernel, stencils, formulation, solver, u0, throw)
-    disc = discretize(problem, cloud, method, order, kernel, stencils, basis_terms, sources=False)
+    check(problem, cloud, method, order, kernel, stencils, formulation, solver, u0, throw, depth)
+    disc = discretize(problem, cloud, method, order, kernel, stencils, basis_terms, sources=False, depth=depth)
     run = Run(disc, problem, solver, throw, kernel is None and stencils is None, formulation)
     run.seconds["set-up"] = time.perf_counter() - start
     if not disc.classes:
@@ -87,7 +93,7 @@ def solve(
     else:
         values, taylor, good, iterations = newton(run, u0)
     run.seconds["total"] = time.perf_counter() - start
-    recipe = Recipe(method, order, basis_terms, run.formulation, problem.fields)
+    recipe = Recipe(method, order, basis_terms, run.formulation, problem.fields, disc.rec.depth)
     fit = Fit(problem, cloud, disc.kernel, table(disc), taylor, recipe)
     report = None if is_traced(values) else run
     return Solution(values, cloud, recipe, fit, good, iterations, run.stats(), report=report)
