@@ -65,9 +65,10 @@ def judgement(records: list[dict[str, Any]], seed: int) -> dict[str, Any]:
     needless = sum(r["kind"] == "right, yet flagged" for r in records)
     note = (
         f"`python -m benchmarks.stability --random --seed {seed} --cases {len(records)}` on {machine['processor']}, "
-        f"JAX {machine['jax']}: random operators of first to fourth order with variable and steep coefficients, nonlinear "
-        "ones and systems, on intervals, boxes, stars, balls, shapes with notches and holes, lattices to random "
-        "clouds, conditions of every kind, orders 2 to 8, solutions from smooth to narrower than the spacing, in float64. "
+        f"JAX {machine['jax']}: random operators of first to fourth order with variable and steep coefficients, "
+        "nonlinear ones and systems, on intervals, boxes, stars, balls, shapes with notches and holes, lattices to "
+        "random clouds, conditions of every kind, orders 2 to 8, solutions from smooth to narrower than the spacing, in "
+        "float64. "
         f"*Wrong*: an error above {WRONG:.0%} (relative L2, of the worst field); *accurate*: below {RIGHT:.0%}. "
         f"Flagged are {needless} of the {right} solutions with an error below {RIGHT:.0%} "
         f"({needless / max(right, 1):.1%})."

@@ -83,7 +83,7 @@ def _trust(disc: Discretization, classes: list[Class], rows: list[Row]) -> Any:
     xp = jnp if traced else np
     ids = np.concatenate([cls.ids for cls in classes])
     lebesgue = xp.concatenate([xp.asarray(row.lebesgue).max(axis=1) for row in rows])
-    part = xp.minimum(1.0, (LEBESGUE / xp.maximum(lebesgue, 1.0)) ** 2)
+    part = xp.minimum(1.0, LEBESGUE / xp.maximum(lebesgue, 1.0))
     trust = xp.ones(len(disc.cloud))
     if traced:
         return trust.at[ids].set(part)[:, None]
