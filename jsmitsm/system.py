@@ -47,6 +47,7 @@ class Run:
         self.against: list[str] = []  # those of the messages that speak against the solution
         self.failed = False
         self.linear: dict[str, Any] = {}
+        self.changes: list[float] = []  # of Newton's steps, relative to the solution
         self.health: health.Health | None = None
         self.imbalance = np.inf  # of a floating field's data, once solved: the mean residual relative to them
         self._refuse_too_large()
@@ -121,19 +122,27 @@ class Run:
         if self.throw:
             raise SolveError(message, [int(i) for i in np.asarray(particles)[:100]])
         self.failed = True
-        self._object(f"FAILED: {message}.")
+        self.object(f"FAILED: {message}.")
 
-    def _object(self, message: str) -> None:
+    def object(self, message: str) -> None:
+        """Note what speaks against the solution."""
         self.messages.append(message)
         self.against.append(message)
 
     def _forget(self) -> None:
         """What an earlier step said speaks of other rows."""
         self.messages, self.against, self.failed = [], [], False
+        self.__dict__.pop("factor", None)
+        self.__dict__.pop("misfit", None)
 
-    def step(self, nums: Numbers) -> tuple[Any, Any]:
-        """Assemble and solve one linear system: values (N, F), and whether it went well."""
+    def step(self, nums: Numbers, altered: Callable[..., Any] | None = None) -> tuple[Any, Any]:
+        """Assemble and solve one linear system: values (N, F), and whether it went well.
+
+        altered: a function of the system's entries, their rows and columns and the right-hand side that returns others.
+        """
         data, r, c, b = self.assembled(nums)
+        if altered is not None:
+            data, r, c, b = altered(data, r, c, b)
         start = time.perf_counter()
         x, good = self.solved(data, r, c, b)
         values = dz.with_held(self.disc, nums, x)
@@ -241,7 +250,7 @@ class Run:
             "coarse for its data"
         )
         if system and min(rest, other) < UNSURE:
-            self._object(f"The data may not balance, and nothing fixes the value {told}.")
+            self.object(f"The data may not balance, and nothing fixes the value {told}.")
         else:
             self.fail(f"the conditions are incompatible: nothing fixes the value, and the data do not balance {told}")
 
@@ -306,6 +315,8 @@ class Run:
             "skipped": skipped(disc, self.linear, self.values is None),
             "messages": list(self.messages),
         }
+        if self.changes:
+            out["changes"] = list(self.changes)
         if "residual" in self.linear:
             out["residual"] = self.linear["residual"]
         if self.health is not None:
