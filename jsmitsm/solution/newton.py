@@ -1,0 +1,216 @@
+"""Newton's method: it arrives from far, ends quadratically, and its end carries derivatives.
+
+The local fits solve the linearised recursion, so that a step from expansions U leads to values and expansions V with
+R(U) + R'(U) (V - U) = 0, for both together. What it lacks of a quadratic rate is the misfit of the fits, which falls
+with the order.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jsmitsm.runtime.errors import SolveError, some
+from jsmitsm.runtime.progress import bar
+from jsmitsm.runtime.tracers import concrete, is_traced
+from jsmitsm.solution.newton_step import Frozen, Iterate, Record, advance, distance, mixed, raising
+from jsmitsm.solution.pseudo_time import relaxed
+from jsmitsm.solution.run import Run
+from jsmitsm.solution.start import harmonic, start
+
+# Steps of one search. A step shorter than DONE of the solution is the last; shorter than GOOD it counts as converged.
+MOST, DONE, GOOD = 50, 1e-10, 1e-8
+# A damped step that must be cut below SHORTEST does not lead on, nor does a search of which so many steps were refused.
+SHORTEST, REFUSED = 1.0 / 16.0, 12
+# Round-off times this and the condition of the matrix may keep the steps from falling, up to a part ROUND_OFF of the
+# solution. Under jit, where no condition is known, steps below STALLED that do not fall are taken to be round-off.
+ROUNDING, ROUND_OFF, STALLED = 10 * np.finfo(float).eps, 1e-6, 1e-7
+# Steps of less than CLOSE of the solution that fall to no less than SLOW of the one before converge linearly, and are
+# mixed with up to DEPTH that came before.
+SLOW, CLOSE, DEPTH = 0.25, 1e-3, 4
+# So many full steps in the end, until one is this short.
+WANDERING, NEAR = 30, 1e-3
+
+
+def newton(run: Run, u0: Any) -> tuple[Any, Any, Any, Any]:
+    """Values (N, F), expansions (N, F, K), whether it converged, and the number of steps.
+
+    The iteration is not differentiated. At its end some steps are repeated with derivatives:
+    near the solution a step contracts errors of the expansions, and those of their derivatives
+    alike, so that this is the implicit derivative and not that of the history.
+    """
+    here, one = _first(run, Iterate(*start(run.disc, run.problem, u0)), u0 is None)
+    if any(concrete(x) is None for x in one):
+        values, taylor, good, steps = _compiled(run, here)
+        rate = 0.1
+    else:
+        with bar("Newton steps") as shown:
+            record = Record(run, shown)
+            (values, taylor), _, good, _ = _searched(record, here.numbers(), one.numbers())
+        run.changes = record.changes
+        steps, rate = record.steps, record.rate
+    if is_traced(one):
+        for _ in range(_repeats(rate)):
+            values, taylor = advance(run, taylor)
+    return values, taylor, good, steps
+
+
+def _repeats(rate: float) -> int:
+    """Steps after which the derivative's error, contracted by ``rate`` each, is below 1e-9."""
+    return int(np.clip(math.ceil(math.log(1e-9) / math.log(min(max(rate, 1e-12), 0.5))), 2, 20))
+
+
+def _first(run: Run, here: Iterate, free: bool) -> tuple[Iterate, Iterate]:
+    """The start and the first full step; ``free``: another start may be taken where the equation is singular there."""
+    try:
+        with raising(run):
+            return here, advance(run, here.taylor)
+    except SolveError as error:
+        other = harmonic(run.disc) if free else None
+        if other is not None:
+            return _first(run, Iterate(*other), False)
+        text = error.args[0]
+        if "u0" not in text:
+            text = (
+                f"the equation linearised at the start of Newton's method ({'u = 0' if free else 'u0'}) is singular "
+                f"({text.split(';')[0]}); give another start, u0=..., at which the derivative of the pde by u does not "
+                "degenerate (not flat where it divides by, or multiplies with, the slope)"
+            )
+        run.fail(text, error.particles)
+    return here, Iterate(*(np.full(np.shape(x), np.nan) for x in here))
+
+
+class Found(NamedTuple):
+    """Where a search ended: what its last step led to, how long that was, whether it converged, and who was frozen."""
+
+    at: Iterate
+    change: float
+    good: bool
+    frozen: np.ndarray
+
+
+def _searched(record: Record, begin: Iterate, first: Iterate) -> Found:
+    """Damped steps; where they lead nowhere, pseudo-time steps, and in the end full ones."""
+    if not np.isfinite(first.values).all():
+        return Found(first, np.inf, False, np.zeros(0, int))
+    best = _damped(record, begin, first)
+    ways = ["damped steps"]
+    for name, search in (("pseudo-time steps", _in_pseudo_time), ("full steps", _wandering)):
+        if best.good:
+            break
+        ways.append(name)
+        near = search(record, begin, first)
+        step = None if near is None else record.tried(near)
+        if near is not None and step is not None:
+            best = min(best, _damped(record, near, step), key=lambda found: (not found.good, found.change))
+    if not best.good:
+        record.run.fail(
+            f"Newton's method did not converge: {', '.join(ways)} were tried, {record.solves} linear solves, and the "
+            f"next one would still change u by {best.change:.1e} of its size; start nearer (u0), approach the "
+            "parameters in stages (js.continuation), or refine the cloud"
+        )
+    elif record.run.disc.floating:
+        record.run.check_balance(best.at.taylor)
+        best = best._replace(good=not record.run.failed)
+    if len(best.frozen):
+        record.run.object(
+            f"The expansions of {len(best.frozen)} particle(s), first {some(best.frozen)}, do not settle: the solution "
+            "is sharper there than the cloud resolves; refine it."
+        )
+    return best
+
+
+def _damped(record: Record, here: Iterate, target: Iterate) -> Found:
+    """Damped Newton's method; the length of the next step must not grow (natural monotonicity)."""
+    # Lengths are absolute: measured against values that grow, a step that leads away looks shorter.
+    length, part, refused = distance(target, here), 1.0, 0
+    record.changes.append(length / target.size)
+    history, frozen = [(here, target)], Frozen(record.run.disc)
+
+    def found(good: bool = False) -> Found:
+        change = length / target.size
+        return Found(target, change, good or change <= GOOD, frozen.particles)
+
+    for _ in range(MOST):
+        if length <= DONE * target.size:
+            break
+        while True:
+            new = frozen.kept(here.toward(target, part) if len(history) < 2 else mixed(history))
+            after = record.tried(new)
+            next_length = np.inf if after is None else distance(after, new)
+            if after is not None and next_length <= max((1.0 - part / 4.0) * length, DONE * new.size):
+                break
+            if part == 1.0 and _rounded(record.run, length, next_length, target.size):
+                return found(True)
+            if len(history) > 1:
+                history = history[-1:]
+            elif after is not None and length < CLOSE * target.size and frozen.more(here, target):
+                continue
+            elif part <= SHORTEST or refused == REFUSED:
+                return found()
+            else:
+                part, refused = part / 2.0, refused + 1
+        rate = next_length / length
+        record.rate = rate if part == 1.0 else record.rate
+        slow = part == 1.0 and rate > SLOW and next_length < CLOSE * after.size
+        history = [*(history[-DEPTH:] if slow else []), (new, after)]
+        here, target, length, part = new, after, next_length, min(1.0, 2.0 * part)
+        record.went(length, target.size)
+    return found()
+
+
+def _rounded(run: Run, length: float, after: float, size: float) -> bool:
+    """Whether a step no longer falls because round-off, amplified by the matrix, is as large."""
+    if length > ROUND_OFF * size or after > 100.0 * length or run.factor is None:
+        return False
+    return length <= ROUNDING * run.factor.condition() * size
+
+
+def _in_pseudo_time(record: Record, begin: Iterate, first: Iterate) -> Iterate | None:
+    """Time begins at the start; how large each field is, it and the held values tell, or else the first full step."""
+    held = np.where(record.run.disc.held, first.values, 0.0)
+    known = np.maximum(np.abs(begin.values), np.abs(held)).max(axis=0)
+    scales = np.where(known > 0, known, np.abs(first.values).max(axis=0))
+    return relaxed(record, begin, np.where(scales > 0, scales, 1.0))
+
+
+def _wandering(record: Record, begin: Iterate, first: Iterate) -> Iterate | None:
+    """Full steps, whatever their length: near singular matrices they are long and lead far, and come back."""
+    here, target = begin, first
+    for _ in range(WANDERING):
+        after = record.tried(target)
+        if after is None:
+            return None
+        here, target = target, after
+        length = distance(target, here)
+        record.went(length, target.size)
+        if length <= NEAR * target.size:
+            return target
+    return None
+
+
+def _compiled(run: Run, here: Iterate) -> tuple[Any, Any, Any, Any]:
+    """Undamped Newton's method where no number can be looked at (under jit)."""
+
+    def more(carry):
+        _, _, change, before, steps = carry
+        return (change > DONE) & (steps < MOST) & ~_stalled(change, before)
+
+    def step(carry):
+        values, taylor, before, _, steps = carry
+        new, taylor = jax.lax.stop_gradient(advance(run, taylor))
+        change = jnp.max(jnp.abs(new - values)) / jnp.maximum(jnp.max(jnp.abs(new)), 1e-300)
+        return new, taylor, change, before, steps + 1
+
+    begin = (jnp.asarray(here.values, float), jnp.asarray(here.taylor, float), jnp.inf, jnp.inf, 0)
+    values, taylor, change, before, steps = jax.lax.while_loop(more, step, begin)
+    return values, taylor, (change <= GOOD) | _stalled(change, before), steps
+
+
+def _stalled(change: Any, before: Any) -> Any:
+    """Round-off: short steps that no longer fall."""
+    return (change <= STALLED) & (change >= before)
