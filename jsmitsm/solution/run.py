@@ -37,6 +37,7 @@ class Run:
         self.disc, self.problem = disc, problem
         self.solver, self.throw, self.repair = solver, throw, repair
         self.formulation = formulation
+        self.began = time.perf_counter()
         self.seconds: dict[str, float] = {"local": 0.0, "assembly": 0.0, "solve": 0.0}
         self.messages: list[str] = []
         self.against: list[str] = []  # those of the messages that speak against the solution
