@@ -21,10 +21,10 @@ import numpy as np
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.equation.problem import Problem
 from jsmitsm.runtime.errors import SolveError
-from jsmitsm.solution.newton_step import Iterate, advance, distance
 from jsmitsm.solution.run import Run
 from jsmitsm.solution.solution import Solution
 from jsmitsm.solution.solve import finished, prepared, solve
+from jsmitsm.solution.steps import Iterate, advance, distance
 
 # The change of the parameter by which the tangent is measured, relative to the distance of the first two.
 NUDGE = 1e-6
@@ -139,7 +139,7 @@ def follow(
     problem: Callable[[float], Problem], cloud: Cloud, parameters: Any, u0: Any, steps: int, options: dict[str, Any],
     shown: Any,
 ) -> Branch:  # fmt: skip
-    """The branch through the solution at the first parameter towards the second, until all are passed in their order."""
+    """The branch through the solution at the first parameter towards the second, all passed in order."""
     first, wanted = float(parameters[0]), [float(c) for c in parameters[1:]]
     sol = solve(problem(first), cloud, u0=u0, **options)
     found, follower = Branch(first, sol), Follower(problem, cloud, wanted[0] - first, options)

@@ -103,8 +103,8 @@ def _onward(problem: Any, cloud: Cloud, at: float, end: float, sol: Solution, op
             step /= 2.0
             if abs(step) < smallest:
                 raise SolveError(
-                    f"continuation stopped at the parameter {at:.6g} on the way to {end:.6g} (a turning point is passed "
-                    f"with arclength=True): {error.args[0]}",
+                    f"continuation stopped at the parameter {at:.6g} on the way to {end:.6g} (arclength=True "
+                    f"passes turning points): {error.args[0]}",
                     error.particles,
                 ) from error
         else:

@@ -217,8 +217,9 @@ class Run:
         """
         self.messages.append("The conditions fix the solution only up to a constant; its mean over the particles is 0.")
         told, certain = unbalanced(
-            self.imbalance, partial(self._imbalance_at, taylor), self.disc.rec.order, self.disc.rec.fields
-        )
+            self.imbalance, partial(self._imbalance_at, taylor), self.disc.rec.order, self.disc.rec.fields,
+            self.disc.linear,
+        )  # fmt: skip
         if certain:
             self.fail(told)
         elif told:
