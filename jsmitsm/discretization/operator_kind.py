@@ -43,7 +43,8 @@ def prefers_least_squares(disc: Discretization, nums: Numbers) -> bool:
     if not drift or concrete(disc.cloud.points) is None:
         return False
     speed = np.linalg.norm(jac[0, drift, 0], axis=0)
-    return bool(np.median(speed * mean_spacing(disc) / diffusion) > 2.0)
+    with np.errstate(divide="ignore", invalid="ignore"):  # nothing is left of a nonlinear equation at a flat start
+        return bool(np.median(speed * mean_spacing(disc) / diffusion) > 2.0)
 
 
 def _timelike(rec: Recursion) -> bool:

@@ -31,6 +31,8 @@ ROUNDING, ROUND_OFF, STALLED = 10 * np.finfo(float).eps, 1e-6, 1e-7
 # Steps of less than CLOSE of the solution that fall to no less than SLOW of the one before converge linearly, and are
 # mixed with up to DEPTH that came before.
 SLOW, CLOSE, DEPTH = 0.25, 1e-3, 4
+# Where only the first full step tells how large the solution is, it may be this much larger than that.
+WARY = 0.01
 # So many full steps in the end, until one is this short.
 WANDERING, NEAR = 30, 1e-3
 
@@ -65,12 +67,16 @@ def _repeats(rate: float) -> int:
 
 def _first(run: Run, here: Iterate, free: bool) -> tuple[Iterate, Iterate]:
     """The start and the first full step; ``free``: another start may be taken where the equation is singular there."""
+    formulation = run.formulation
     try:
         with raising(run):
-            return here, advance(run, here.taylor)
+            one = advance(run, here.taylor)
+            _refuse_degenerate(run)
+            return here, one
     except SolveError as error:
         other = harmonic(run.disc) if free else None
         if other is not None:
+            run.formulation = formulation
             return _first(run, Iterate(*other), False)
         text = error.args[0]
         if "u0" not in text:
@@ -90,6 +96,16 @@ class Found(NamedTuple):
     change: float
     good: bool
     frozen: np.ndarray
+
+
+def _refuse_degenerate(run: Run) -> None:
+    """An equation of which nothing is left at a particle leaves its fit free there, and the system regular."""
+    if run.nums is None or is_traced(run.nums.jac):
+        return
+    left = np.abs(np.asarray(run.nums.jac)[:, :, 0]).max(axis=1).min(axis=0)
+    if (left == 0).any():
+        at = np.broadcast_to(run.nums.ids, np.broadcast_shapes(run.nums.ids.shape, left.shape))[left == 0]
+        run.fail(f"nothing of the equation is left at {len(at)} particle(s), first {some(at)}", at)
 
 
 def _searched(record: Record, begin: Iterate, first: Iterate) -> Found:
@@ -174,7 +190,9 @@ def _in_pseudo_time(record: Record, begin: Iterate, first: Iterate) -> Iterate |
     held = np.where(record.run.disc.held, first.values, 0.0)
     known = np.maximum(np.abs(begin.values), np.abs(held)).max(axis=0)
     scales = np.where(known > 0, known, np.abs(first.values).max(axis=0))
-    return relaxed(record, begin, np.where(scales > 0, scales, 1.0))
+    scales = np.where(scales > 0, scales, 1.0)
+    near = relaxed(record, begin, scales)
+    return near if near is not None or known.all() else relaxed(record, begin, WARY * scales)
 
 
 def _wandering(record: Record, begin: Iterate, first: Iterate) -> Iterate | None:

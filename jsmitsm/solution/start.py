@@ -57,7 +57,10 @@ def harmonic(disc: Discretization) -> tuple[np.ndarray, np.ndarray] | None:
             if known is None:
                 return None
             held[group.ids, k] = known
-    n, near = len(held), disc.images.owners(np.asarray(near))[:, : 1 + 2 * disc.rec.dim]
+    points, near, n = np.asarray(disc.points), np.asarray(near), len(held)
+    away = np.where(near >= 0, np.linalg.norm(points[np.maximum(near, 0)] - points[:n, None], axis=2), np.inf)
+    nearest = np.argsort(away, axis=1, kind="stable")[:, : 1 + 2 * disc.rec.dim]
+    near = disc.images.owners(np.take_along_axis(near, nearest, axis=1))
     at, others = np.repeat(np.arange(n), near.shape[1]), near.reshape(-1)
     keep = (others >= 0) & (others != at)
     mean = sparse.csr_array((np.ones(keep.sum()), (at[keep], others[keep])), shape=(n, n))
