@@ -13,7 +13,7 @@ import numpy as np
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.cloud.quadrature import quadrature
 from jsmitsm.particle.polynomials import derivative_table, monomials
-from jsmitsm.runtime.errors import SolveError
+from jsmitsm.runtime.errors import SolveError, refuse_masked
 from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.solution.estimate import error_estimate
 from jsmitsm.solution.fit import Recipe
@@ -272,6 +272,7 @@ class Solution:
 
 def _checked_points(points: Any, dim: int) -> Any:
     if not is_traced(points):
+        refuse_masked(points, "points")
         try:
             if np.iscomplexobj(points):
                 raise TypeError
