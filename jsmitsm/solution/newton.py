@@ -182,7 +182,7 @@ def _rounded(run: Run, length: float, after: float, size: float) -> bool:
     """Whether a step no longer falls because round-off, amplified by the matrix, is as large."""
     if length > ROUND_OFF * size or after > 100.0 * length or run.factor is None:
         return False
-    return length <= ROUNDING * run.factor.condition() * size
+    return bool(length <= ROUNDING * run.factor.condition() * size)
 
 
 def _in_pseudo_time(record: Record, begin: Iterate, first: Iterate) -> Iterate | None:

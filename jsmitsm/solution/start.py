@@ -66,7 +66,7 @@ def harmonic(disc: Discretization) -> tuple[np.ndarray, np.ndarray] | None:
     mean = sparse.csr_array((np.ones(keep.sum()), (at[keep], others[keep])), shape=(n, n))
     laplace = (sparse.diags_array(mean.sum(axis=1)) - mean).tocsr()
     values = held.copy()
-    for k in range(held.shape[1]):
+    for k in range(disc.rec.fields):
         known, free = np.flatnonzero(disc.held[:, k]), np.flatnonzero(~disc.held[:, k])
         if len(free) and len(known) and np.ptp(held[known, k]) > 0:
             values[free, k] = spsolve(laplace[free][:, free].tocsc(), -laplace[free][:, known] @ held[known, k])
