@@ -33,6 +33,7 @@ ROUNDING, ROUND_OFF, STALLED = 10 * np.finfo(float).eps, 1e-6, 1e-7
 SLOW, CLOSE, DEPTH = 0.25, 1e-3, 4
 # Where only the first full step tells how large the solution is, it may be this much larger than that.
 WARY = 0.01
+NOTHING = "nothing of the equation is left"
 # So many full steps in the end, until one is this short.
 WANDERING, NEAR = 30, 1e-3
 
@@ -79,11 +80,11 @@ def _first(run: Run, here: Iterate, free: bool) -> tuple[Iterate, Iterate]:
             run.formulation = formulation
             return _first(run, Iterate(*other), False)
         text = error.args[0]
-        if "u0" not in text:
+        if "singular" in text or NOTHING in text:
             text = (
                 f"the equation linearised at the start of Newton's method ({'u = 0' if free else 'u0'}) is singular "
                 f"({text.split(';')[0]}); give another start, u0=..., at which the derivative of the pde by u does not "
-                "degenerate (not flat where it divides by, or multiplies with, the slope)"
+                "degenerate (not flat where the slope is a factor), or a condition that is missing"
             )
         run.fail(text, error.particles)
     return here, Iterate(*(np.full(np.shape(x), np.nan) for x in here))
@@ -105,7 +106,7 @@ def _refuse_degenerate(run: Run) -> None:
     left = np.abs(np.asarray(run.nums.jac)[:, :, 0]).max(axis=1).min(axis=0)
     if (left == 0).any():
         at = np.broadcast_to(run.nums.ids, np.broadcast_shapes(run.nums.ids.shape, left.shape))[left == 0]
-        run.fail(f"nothing of the equation is left at {len(at)} particle(s), first {some(at)}", at)
+        run.fail(f"{NOTHING} at {len(at)} particle(s), first {some(at)}", at)
 
 
 def _searched(record: Record, begin: Iterate, first: Iterate) -> Found:
