@@ -32,7 +32,8 @@ def differences(f, slope, x, start):
 
 
 def kink(start, order, n):
-    problem = js.Problem(lambda u, x: js.laplacian(u)(x) - u(x) ** 3 + u(x), ends(np.tanh(-6 / ROOT), np.tanh(6 / ROOT)))
+    far = np.tanh(6 / ROOT)
+    problem = js.Problem(lambda u, x: js.laplacian(u)(x) - u(x) ** 3 + u(x), ends(-far, far))
     cloud = js.interval(-6.0, 6.0, n)
     sol = js.solve(problem, cloud, order=order, u0=start)
     return sol, np.abs(sol.u - np.tanh(cloud.points[:, 0] / ROOT)).max()
@@ -77,7 +78,8 @@ def test_uptake_from_a_line():
             js.Problem(lambda u, x, p: js.laplacian(u)(x) - p[0] * u(x) / (p[1] + u(x)), ends(0.0, 1.0), params=(a, k)),
             cloud, u0=lambda x, p: x[0],
         )  # fmt: skip
-        known = differences(lambda u, x: a * u / (k + u), lambda u, x: a * k / (k + u) ** 2, fine, fine**8)
+        rate, slope = lambda u, x, a=a, k=k: a * u / (k + u), lambda u, x, a=a, k=k: a * k / (k + u) ** 2
+        known = differences(rate, slope, fine, fine**8)
         assert sol.converged
         np.testing.assert_allclose(sol.u, known[::200], atol=2e-3)
 
@@ -159,7 +161,7 @@ def test_it_ends_quadratically_on_random_particles(order):
 
 def test_what_was_tried_is_told():
     bratu = js.Problem(lambda u, x: js.laplacian(u)(x) + 5.0 * jnp.exp(u(x)), ends(0.0, 0.0))
-    with pytest.raises(js.SolveError, match="damped steps, pseudo-time steps, full steps were tried, .*js.continuation"):
+    with pytest.raises(js.SolveError, match="damped steps, pseudo-time steps, full steps were tried, .*stages"):
         js.solve(bratu, js.interval(0.0, 1.0, 21))
 
 

@@ -208,7 +208,7 @@ def _wider(factor: float):
     """The nearest neighbours, ``factor`` times as many."""
 
     def attempt(points: np.ndarray, ids: np.ndarray, size: int) -> np.ndarray:
-        return nearest(points, min(len(points), round(factor * size)), ids).indices
+        return np.asarray(nearest(points, min(len(points), round(factor * size)), ids).indices)
 
     return attempt
 

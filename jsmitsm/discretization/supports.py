@@ -72,7 +72,7 @@ def find_stencils(
         found, full = nearest(points, size, which), min(default_size(scheme), len(points))
         if size == full:
             return found
-        wide = jumps(found.radius, images.owners(found.indices))
+        wide = jumps(np.asarray(found.radius), images.owners(found.indices))
         if cloud.dim == 3:  # there a Neumann side with small stencils has an error ten times that of the rest
             wide = np.union1d(wide, conditioned)
         return replaced(found, wide, nearest(points, full, wide)) if len(wide) else found

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeAlias, TypeVar, overload
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,14 @@ import numpy as np
 from jsmitsm.equation.field import Field, LocalField, total, unit
 from jsmitsm.taylor.multi_indices import MultiIndex
 
+Function: TypeAlias = Callable[[Any], jax.Array]
+Same = TypeVar("Same", Field, LocalField)
 
+
+@overload
+def partial(u: Same, multi_index: MultiIndex | int) -> Same: ...
+@overload
+def partial(u: Function, multi_index: MultiIndex | int) -> Function: ...
 def partial(u: Any, multi_index: MultiIndex | int) -> Any:
     """The derivative d^a u, a function of the point.
 
@@ -44,6 +51,10 @@ def partial(u: Any, multi_index: MultiIndex | int) -> Any:
     return derivative
 
 
+@overload
+def grad(u: Field | LocalField) -> LocalField: ...
+@overload
+def grad(u: Function) -> Function: ...
 def grad(u: Any) -> Any:
     """The gradient of ``u``, a function of the point; derivatives on the last axis.
 
@@ -62,6 +73,10 @@ def grad(u: Any) -> Any:
     return lambda x: jnp.stack([_along(function, i)(_point(x)) for i in range(len(_point(x)))], -1)
 
 
+@overload
+def hessian(u: Field | LocalField) -> LocalField: ...
+@overload
+def hessian(u: Function) -> Function: ...
 def hessian(u: Any) -> Any:
     """The second derivatives of ``u``, a function of the point: (D, D), or (F, D, D).
 
@@ -87,6 +102,10 @@ def hessian(u: Any) -> Any:
     return matrix
 
 
+@overload
+def laplacian(u: Same) -> Same: ...
+@overload
+def laplacian(u: Function) -> Function: ...
 def laplacian(u: Any) -> Any:
     """The sum of the second derivatives of ``u``, a function of the point: a scalar, or (F,).
 
@@ -104,6 +123,10 @@ def laplacian(u: Any) -> Any:
     return lambda x: total(_along(_along(function, i), i)(_point(x)) for i in range(len(_point(x))))
 
 
+@overload
+def divergence(v: LocalField) -> Field | LocalField: ...
+@overload
+def divergence(v: Function) -> Function: ...
 def divergence(v: Any) -> Any:
     """The divergence of ``v``, a function of the point, summed over the last axis.
 

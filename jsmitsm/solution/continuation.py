@@ -3,26 +3,57 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Literal, Unpack, overload
 
 import numpy as np
 
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.equation.problem import Problem
+from jsmitsm.particle.kernels import Kernel
+from jsmitsm.runtime.arrays import Array, ValueOrFunction
 from jsmitsm.runtime.errors import SolveError
 from jsmitsm.runtime.progress import bar
-from jsmitsm.solution.branch import follow
+from jsmitsm.solution.arguments import SolveOptions
+from jsmitsm.solution.branch import Branch, follow
 from jsmitsm.solution.solution import Solution
 from jsmitsm.solution.solve import solve
+
+
+class StageOptions(SolveOptions, total=False):
+    """Options of :func:`jsmitsm.solve` for every stage."""
+
+    kernel: Kernel | None
+
 
 # A stage is halved this often before continuation gives up.
 _HALVINGS = 6
 
 
+@overload
 def continuation(
-    problem: Callable[[float], Problem], cloud: Cloud, parameters: Sequence[float], *, u0: Any = None,
-    arclength: bool = False, steps: int = 100, **options: Any,
-) -> list[Solution]:  # fmt: skip
+    problem: Callable[[float], Problem], cloud: Cloud, parameters: Sequence[float] | Array, *,
+    u0: ValueOrFunction | None = None, arclength: Literal[False] = False, steps: int = 100,
+    **options: Unpack[StageOptions],
+) -> list[Solution]: ...  # fmt: skip
+
+
+@overload
+def continuation(
+    problem: Callable[[float], Problem], cloud: Cloud, parameters: Sequence[float] | Array, *,
+    u0: ValueOrFunction | None = None, arclength: bool, steps: int = 100, **options: Unpack[StageOptions],
+) -> Branch: ...  # fmt: skip
+
+
+def continuation(
+    problem: Callable[[float], Problem],
+    cloud: Cloud,
+    parameters: Sequence[float] | Array,
+    *,
+    u0: ValueOrFunction | None = None,
+    arclength: bool = False,
+    steps: int = 100,
+    **options: Unpack[StageOptions],
+) -> list[Solution]:
     """Solve ``problem(parameter)`` for a sequence of parameters, each from the solution before.
 
     Parameters
@@ -73,7 +104,7 @@ def continuation(
         raise ValueError(
             f"problem: expected a function of the parameter that returns a js.Problem, got {type(problem).__name__}"
         )
-    options = {**options, "throw": True}
+    options["throw"] = True
     if arclength:
         if values[0] == values[1]:
             raise ValueError(
@@ -82,7 +113,7 @@ def continuation(
         if isinstance(steps, bool) or not isinstance(steps, int | np.integer) or steps < 1:
             raise ValueError(f"steps: expected a whole number from 1, the most steps along the branch, got {steps!r}")
         with bar("continuation", len(values)) as shown:
-            return follow(problem, cloud, values, u0, int(steps), options, shown)
+            return follow(problem, cloud, values, u0, int(steps), dict(options), shown)
     with bar("continuation", len(values)) as shown:
         sols = [solve(problem(float(values[0])), cloud, u0=u0, **options)]
         shown.update()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, Protocol
 
@@ -13,6 +13,7 @@ import numpy as np
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.cloud.quadrature import quadrature
 from jsmitsm.particle.polynomials import derivative_table, monomials
+from jsmitsm.runtime.arrays import Array, ArrayLike, ValueOrFunction
 from jsmitsm.runtime.errors import SolveError, refuse_masked
 from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.solution.estimate import error_estimate
@@ -66,8 +67,8 @@ class Solution:
         self._recipe: Recipe = recipe
         self._fit = fit  # a pytree with a method .coefficients(values) and friends
         self._fitted = fitted  # (N, F, K) or None
-        self.converged = converged
-        self.iterations = iterations
+        self.converged: bool | jax.Array = converged
+        self.iterations: int | jax.Array = iterations
         self.stats: dict[str, Any] = stats
         self._report: Report | None = report
         self._found: list[str] | None = None  # what the report said
@@ -84,7 +85,7 @@ class Solution:
         return self._recipe.order
 
     @property
-    def u(self) -> Any:
+    def u(self) -> Array:
         """Values (N,) at the particles, in the cloud's order; (N, F) for a system."""
         return self._values[..., 0] if self._recipe.fields == 1 else self._values
 
@@ -99,7 +100,7 @@ class Solution:
             )
 
     @property
-    def coefficients(self) -> Any:
+    def coefficients(self) -> Array:
         """Taylor coefficients d^a u / a!, (N, K), ordered as :func:`jsmitsm.multi_indices`; (N, K, F) for a system."""
         fitted = self._taylor
         return fitted[:, 0] if self._recipe.fields == 1 else jnp.swapaxes(fitted, 1, 2)
@@ -115,7 +116,7 @@ class Solution:
             self._fitted = fitted
         return self._fitted
 
-    def __call__(self, points: Any, *, blend: bool = False) -> Any:
+    def __call__(self, points: ArrayLike, *, blend: bool = False) -> jax.Array:
         """Values (M,) at ``points`` (M, D), (M, F) for a system.
 
         Each point takes the polynomial of its nearest particle, or with ``blend`` a smooth average
@@ -126,7 +127,7 @@ class Solution:
         """
         return self.derivative(points, (0,) * self.cloud.dim, blend=blend)
 
-    def grad(self, points: Any, *, blend: bool = False) -> Any:
+    def grad(self, points: ArrayLike, *, blend: bool = False) -> jax.Array:
         """Gradients (M, D) at ``points`` (M, D), (M, F, D) for a system; ``blend`` as for values.
 
         Raises ValueError for points of another shape, NaN or infinite ones.
@@ -134,7 +135,7 @@ class Solution:
         unit = np.eye(self.cloud.dim, dtype=int)
         return jnp.stack([self.derivative(points, tuple(map(int, b)), blend=blend) for b in unit], axis=-1)
 
-    def derivative(self, points: Any, multi_index: tuple[int, ...], *, blend: bool = False) -> Any:
+    def derivative(self, points: ArrayLike, multi_index: Sequence[int], *, blend: bool = False) -> jax.Array:
         """The derivative d^b u at ``points`` (M, D), b = ``multi_index``, |b| at most the order: (M,) or (M, F).
 
         With ``blend`` the polynomials' derivatives are averaged. Raises ValueError for wrong points or orders.
@@ -152,7 +153,7 @@ class Solution:
         values = _evaluate(b, self.order, self.cloud.points, self._taylor, points, near, weight)
         return values[:, 0] if self._recipe.fields == 1 else values
 
-    def integral(self, group: str) -> Any:
+    def integral(self, group: str) -> jax.Array:
         """The integral of u over a boundary group, a scalar or (F,); see :func:`jsmitsm.quadrature`.
 
         Raises ValueError for a group that is no boundary group.
@@ -161,7 +162,7 @@ class Solution:
         points, weights, _ = quadrature(self.cloud, group)
         return jnp.tensordot(weights, self(points), axes=1)
 
-    def flux(self, group: str, conductivity: Any = 1.0) -> Any:
+    def flux(self, group: str, conductivity: ValueOrFunction = 1.0) -> jax.Array:
         """The integral of conductivity n . grad u over a boundary group, n outward: a scalar or (F,).
 
         conductivity : a number, or a function of one point x (D,).
@@ -177,7 +178,7 @@ class Solution:
         slope = jnp.einsum("q...d,qd->q...", self.grad(points), normals)
         return jnp.tensordot(weights * conductivity, slope, axes=1)
 
-    def error_estimate(self) -> Any:
+    def error_estimate(self) -> Array:
         """Estimated error |u - u_exact| at every particle, (N,) or (N, F), by defect correction.
 
         Computed when asked for: one more assembly at order p + 2 and one solve with the kept factors.
@@ -215,7 +216,7 @@ class Solution:
         large = f"The estimated error is {self._share:.0%} of the solution: refine the cloud, or change the order."
         return [*(self._found or []), *([] if self._share <= LARGE else [large])]
 
-    def condition_numbers(self) -> tuple[Any, float]:
+    def condition_numbers(self) -> tuple[np.ndarray, float]:
         """The condition number (N,) of every particle's moment matrix, and an estimate of the global system's.
 
         The matrices are those with rows and columns scaled to about one, so that units do not count.
