@@ -40,7 +40,7 @@ def continuation(
 @overload
 def continuation(
     problem: Callable[[float], Problem], cloud: Cloud, parameters: Sequence[float] | Array, *,
-    u0: ValueOrFunction | None = None, arclength: bool, steps: int = 100, **options: Unpack[StageOptions],
+    u0: ValueOrFunction | None = None, arclength: Literal[True], steps: int = 100, **options: Unpack[StageOptions],
 ) -> Branch: ...  # fmt: skip
 
 
