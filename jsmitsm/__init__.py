@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 from jsmitsm.cloud.cloud import Cloud, box, interval, rectangle
 from jsmitsm.cloud.neighbours import Stencils, stencils
+from jsmitsm.equation.marks import meant
 from jsmitsm.equation.operators import divergence, grad, hessian, laplacian, partial
 from jsmitsm.equation.problem import Condition, Problem, condition, dirichlet, fix, free, neumann, periodic, robin
 from jsmitsm.linear.linsolve import Solver
@@ -23,9 +24,9 @@ __all__ = [
     "Cloud", "Condition", "Constant", "CubicSpline", "Factorization", "Formulation", "Gaussian", "Kernel", "Method",
     "Problem", "Quality", "Solution", "SolveError", "Solver", "Stencils", "SuperGaussian", "TuneResult", "Wendland",
     "box", "condition", "continuation", "dirichlet", "divergence", "factorize", "files", "fix", "free", "from_polygon",
-    "from_sdf", "grad", "hessian", "interval", "laplacian", "multi_indices", "neumann", "no_progress", "partial",
-    "periodic", "plot", "quadrature", "quality", "rectangle", "robin", "sdf", "show_versions", "solve", "stencils",
-    "tune",
+    "from_sdf", "grad", "hessian", "interval", "laplacian", "meant", "multi_indices", "neumann", "no_progress",
+    "partial", "periodic", "plot", "quadrature", "quality", "rectangle", "robin", "sdf", "show_versions", "solve",
+    "stencils", "tune",
 ]  # fmt: skip
 
 # Imported when first used: they need more than solving does. Where each stands is said twice, to type checkers and to

@@ -9,8 +9,10 @@ from typing import Any, TypeAlias, TypeVar, overload
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.ad_checkpoint import checkpoint_name
 
 from jsmitsm.equation.field import Field, LocalField, total, unit
+from jsmitsm.equation.marks import ALONG, DIFFERENTIATED
 from jsmitsm.taylor.multi_indices import MultiIndex
 
 Function: TypeAlias = Callable[[Any], jax.Array]
@@ -195,9 +197,13 @@ def _array_valued(function: Any) -> Callable[[Any], Any]:
 def _along(function: Callable[[Any], Any], axis: int) -> Callable[[Any], Any]:
     """The derivative of a function of the point along one axis, by forward mode."""
 
+    def named(y: Any) -> Any:
+        return checkpoint_name(function(y), f"{DIFFERENTIATED}{axis}")
+
     def slope(y: Any) -> Any:
         direction = np.zeros(len(y), y.dtype)
         direction[axis] = 1
-        return jax.jvp(function, (y,), (direction,))[1]
+        with jax.named_scope(ALONG):
+            return jax.jvp(named, (y,), (direction,))[1]
 
     return slope

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -14,13 +14,15 @@ import numpy as np
 from jax.extend.core import Literal
 
 from jsmitsm.equation import dependence
+from jsmitsm.equation.branches import Branches, branches
 from jsmitsm.equation.dependence import EXTRAS, FIELD, JUMPS, POINT, Facts
 from jsmitsm.equation.field import local_field
+from jsmitsm.equation.jumps import jumps
 from jsmitsm.equation.linearizing import Record, record
 from jsmitsm.equation.recording import recalled
 from jsmitsm.runtime.compiled import fingerprint, kept
 from jsmitsm.runtime.jaxprs import EVERYTHING, NOTHING, levels
-from jsmitsm.runtime.tracers import is_traced
+from jsmitsm.runtime.tracers import any_number, is_traced
 from jsmitsm.runtime.whole_program import in_one_program
 from jsmitsm.taylor.jets import evaluate, plain
 from jsmitsm.taylor.multi_indices import Slot, count
@@ -41,7 +43,7 @@ class Traced:
     derivative, -1 if none.  ``linear``: no coefficient depends on the field.  ``constant``: linear,
     and no coefficient depends on x or the extras (on parameters it may).  ``source``: what a
     residual leaves at u = 0: "zero", "constant" or "variable" (in x or the extras).
-    ``uses_extras``: whether an extra reaches the residual.
+    ``uses_extras``: whether an extra reaches the residual.  ``branches``: those that it differentiates, if any.
     """
 
     dim: int
@@ -54,6 +56,7 @@ class Traced:
     constant: bool
     source: str
     uses_extras: bool
+    branches: Branches | None = field(repr=False)
     _record: Record = field(repr=False)
     _n_extras: int = field(repr=False)
     _params_tree: Any = field(repr=False)
@@ -82,6 +85,17 @@ class Traced:
         if self.source == "zero" and slots is None:
             return jac, None
         return jac, self._compute(inputs, degree, False, True)[1]
+
+    def with_any_numbers(self) -> Traced:
+        """The same with some numbers for the constants that are only traced."""
+        return replace(self, _record=self._record._replace(consts=tuple(map(any_number, self._record.consts))))
+
+    def jumps(self, points: Any, near: Any, *, params: Any = None, slots: Any = None) -> str | None:
+        """What jumps under a derivative, in words, see :mod:`jsmitsm.jumps`; None: nothing does."""
+        if self.branches is None:
+            return None
+        consts = self._record.consts[len(self._record.consts) - len(self._record.written.constvars) :]
+        return jumps(self.branches, points, near, params, consts, slots)
 
     def _inputs(self, points: Any, degree: int, extras: Sequence[Any], params: Any, slots: Any) -> _Inputs:
         """Check and bring in the order of the jaxpr."""
@@ -338,6 +352,7 @@ def _classified(r: Record, dim: int, fields: int, n_extras: int, params_tree: An
         constant=linear and not every & (POINT | EXTRAS),
         source=source,
         uses_extras=bool((every | _bits(facts[0])) & EXTRAS),
+        branches=branches(r.written, r.consts[len(r.consts) - len(r.written.constvars) :], n_extras),
         _record=r,
         _n_extras=n_extras,
         _params_tree=params_tree,

@@ -14,6 +14,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jsmitsm.discretization.coefficients import slot_series
+from jsmitsm.discretization.layout import refuse_jumps
+from jsmitsm.equation.branches import FIELD
 from jsmitsm.runtime.errors import SolveError, some
 from jsmitsm.runtime.progress import bar
 from jsmitsm.runtime.tracers import concrete, is_traced
@@ -33,7 +36,7 @@ ROUNDING, ROUND_OFF, STALLED = 10 * np.finfo(float).eps, 1e-6, 1e-7
 SLOW, CLOSE, DEPTH = 0.25, 1e-3, 4
 # Where only the first full step tells how large the solution is, it may be this much larger than that.
 WARY = 0.01
-NOTHING = "nothing of the equation is left"
+NOTHING = "the equation says nothing"
 # So many full steps in the end, until one is this short.
 WANDERING, NEAR = 30, 1e-3
 
@@ -55,10 +58,21 @@ def newton(run: Run, u0: Any) -> tuple[Any, Any, Any, Any]:
             (values, taylor), _, good, _ = _searched(record, here.numbers(), one.numbers())
         run.changes = record.changes
         steps, rate = record.steps, record.rate
+    _refuse_jumps(run, values, taylor)
     if is_traced(one):
         for _ in range(_repeats(rate)):
             values, taylor = advance(run, taylor)
     return values, taylor, good, steps
+
+
+def _refuse_jumps(run: Run, values: Any, taylor: Any) -> None:
+    """Refuse jumps that the operator differentiates where they depend on u, as it has come out."""
+    disc, found = run.disc, run.disc.traced.branches
+    if found is None or not found.depends & FIELD:
+        return
+    slots, place = slot_series(disc.rec, found.slots, taylor, 0)[:, 0], (0,) * disc.rec.dim
+    given = [values[:, f] if b == place else slots[k] for k, (f, b) in enumerate(found.slots)]
+    refuse_jumps(disc, run.problem, (jnp if is_traced(given) else np).stack(given))
 
 
 def _repeats(rate: float) -> int:
@@ -124,6 +138,7 @@ def _searched(record: Record, begin: Iterate, first: Iterate) -> Found:
         if near is not None and step is not None:
             best = min(best, _damped(record, near, step), key=lambda found: (not found.good, found.change))
     if not best.good:
+        _refuse_jumps(record.run, *best.at)
         record.run.fail(
             f"Newton's method did not converge: {', '.join(ways)} were tried, {record.solves} linear solves, and the "
             f"next one would still change u by {best.change:.1e} of its size; start nearer (u0), approach the "
