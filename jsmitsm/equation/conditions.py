@@ -15,6 +15,7 @@ import numpy as np
 from jsmitsm.cloud.cloud import INTERIOR, Cloud
 from jsmitsm.equation.problem import Condition, Problem
 from jsmitsm.equation.tracing import Traced, trace
+from jsmitsm.runtime.errors import IN_FUNCTIONS, did_you_mean, in_words
 from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.runtime.whole_program import in_one_program, picked
 from jsmitsm.taylor.multi_indices import Slot
@@ -68,7 +69,8 @@ def group_conditions(problem: Problem, cloud: Cloud, order: int, orders: tuple[i
     used = {name for cs in given.values() for c in cs if c.kind == "periodic" for name in c.groups}
     unknown = sorted(used - set(names))
     if unknown:
-        raise ValueError(f"bcs: periodic names {unknown[0]!r}, which is no boundary group of the cloud; it has {names}")
+        raise ValueError(f"bcs: periodic names {unknown[0]!r}, which is no boundary group of the cloud; it has {names}"
+                         + did_you_mean(unknown[0], names))  # fmt: skip
     missing = [n for n in names if n not in given and n not in used and len(cloud.groups[n])]
     if missing:
         stray = [n for n in given if n not in cloud.groups]
@@ -76,6 +78,7 @@ def group_conditions(problem: Problem, cloud: Cloud, order: int, orders: tuple[i
             f"bcs: no condition for the boundary group(s) {missing}; the cloud has {names}"
             + (f", but not {stray}. " if stray else ". ") +
             "Give each a condition, js.free() where none belongs"
+            + next(filter(None, (did_you_mean(n, missing) for n in stray)), "")
         )
     seconds = {c.groups[1] for cs in given.values() for c in cs if c.kind == "periodic"}
     for name in seconds & set(given):
@@ -90,7 +93,7 @@ def group_conditions(problem: Problem, cloud: Cloud, order: int, orders: tuple[i
     for name, conditions in given.items():
         pinned = [c for c in conditions if c.kind == "fix"]
         if name not in cloud.groups and len(pinned) < len([c for c in conditions if c.kind != "periodic"]):
-            raise ValueError(f"bcs: {name!r} is no group of the cloud; it has {names}")
+            raise ValueError(f"bcs: {name!r} is no group of the cloud; it has {names}{did_you_mean(name, names)}")
         if name == INTERIOR and len(pinned) < len(conditions):
             raise ValueError('bcs: "interior" takes no boundary condition; hold single particles with js.fix')
         groups += [_laid_out(problem, cloud, name, np.array(c.indices), [c], order, highest) for c in pinned]
@@ -253,22 +256,10 @@ def _named(where: str, expected: str) -> Iterator[None]:
     """Say which of the user's functions failed, and what was expected of it."""
     try:
         yield
-    except (TypeError, ValueError, IndexError) as error:
+    except IN_FUNCTIONS as error:
         if str(error).startswith(where):
             raise
         raise ValueError(f"{where}: expected {expected}; calling it failed: {in_words(error)}") from error
-
-
-def in_words(error: Exception) -> str:
-    """What went wrong in a user's function, with the remedy where Python's own message has none."""
-    text = str(error)
-    if isinstance(error, jax.errors.ConcretizationTypeError | jax.errors.TracerArrayConversionError):
-        return (f"{text.splitlines()[0]} It must be written in jax.numpy: jnp.sin for np.sin or math.sin, "
-                "jnp.where for an if")  # fmt: skip
-    if isinstance(error, IndexError):
-        return (f"{text}; x is one point of shape (D,), x[0] its first coordinate; u(x) is a number, and a vector (F,) "
-                "with js.Problem(..., fields=F)")  # fmt: skip
-    return text
 
 
 def _shaped(result: Any, components: int, where: str) -> Any:

@@ -259,7 +259,7 @@ class Run:
     def _imbalance_at(self, taylor: Any, order: int) -> float:
         """The mean residual, relative to the data, of the same problem with method S of another order."""
         cloud = self.disc.cloud
-        disc = discretize(self.problem, cloud, "S", order, None, None, None)
+        disc = discretize(self.problem, cloud, "S", order, None, None, None, depth=self.disc.rec.depth)
         other = Run(disc, self.problem, self.solver, False, True, "loo")
         if taylor is not None:
             more = max(0, disc.rec.size - taylor.shape[2])
@@ -312,6 +312,7 @@ class Run:
         disc = self.disc
         out: dict[str, Any] = {
             "seconds": dict(self.seconds),
+            "depth": disc.rec.depth,
             "particles": len(disc.cloud),
             "unknowns": int((~disc.held).sum()),
             "neighbours": max((c.neighbours.shape[1] for c in disc.classes), default=0),

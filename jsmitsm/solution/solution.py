@@ -81,8 +81,13 @@ class Solution:
 
     @property
     def order(self) -> int:
-        """The degree of the local Taylor polynomials."""
+        """The degree of the local fits."""
         return self._recipe.order
+
+    @property
+    def depth(self) -> int:
+        """Degrees by which the local Taylor polynomials exceed the order."""
+        return self._recipe.depth
 
     @property
     def u(self) -> Array:
@@ -150,7 +155,7 @@ class Solution:
                 f"got {multi_index!r}"
             )
         near, weight = _nearest(self.cloud.points, points, self.cloud.dim + 2 if blend else 1)
-        values = _evaluate(b, self.order, self.cloud.points, self._taylor, points, near, weight)
+        values = _evaluate(b, self._recipe.reach, self.cloud.points, self._taylor, points, near, weight)
         return values[:, 0] if self._recipe.fields == 1 else values
 
     def integral(self, group: str) -> jax.Array:
@@ -250,8 +255,9 @@ class Solution:
 
     def __repr__(self) -> str:
         shape = "x".join(map(str, self.u.shape))
+        deep = f", depth={self.depth}" if self.depth else ""
         state = "" if is_traced(self.converged) else f", converged={bool(np.all(self.converged))}"
-        return f"Solution(u: {shape}, method={self.method!r}, order={self.order}{state})"
+        return f"Solution(u: {shape}, method={self.method!r}, order={self.order}{deep}{state})"
 
     def tree_flatten(self):
         return (self._values, self.cloud, self._fit, self._fitted, self.converged, self.iterations), self._recipe
@@ -278,7 +284,7 @@ def _checked_points(points: Any, dim: int) -> Any:
             if np.iscomplexobj(points):
                 raise TypeError
             points = np.asarray(points, dtype=float)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             raise ValueError(
                 f"points: expected real numbers of shape (M, {dim}), got {type(points).__name__}"
             ) from None
