@@ -90,7 +90,7 @@ class Frozen:
 
     def more(self, here: Iterate, target: Iterate) -> bool:
         """Freeze those whose expansions move most, few in number; False where too many do."""
-        degrees = np.array([sum(a) for a in multi_indices(self.disc.rec.dim, self.disc.rec.order)])
+        degrees = np.array([sum(a) for a in multi_indices(self.disc.rec.dim, self.disc.rec.reach)])
         moved = np.abs(target.taylor - here.taylor) * np.asarray(lengths(self.disc))[:, None, None] ** degrees
         moved = moved.max(axis=(1, 2))
         moved[self.particles] = 0.0
