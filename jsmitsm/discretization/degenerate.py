@@ -83,7 +83,8 @@ def settled(disc: Discretization, problem: Problem, nums: Any) -> Any:
     if seen and disc.scheme.method == "S" and np.shape(nums.jac)[-1] > 1:
         jac = concrete(nums.jac)
         jac = _in_general(disc, problem, nums.ids) if jac is None else np.asarray(jac)
-        at, least = candidates(disc, jac)
+        # What is not finite is told where the rows are made.
+        at, least = candidates(disc, jac) if np.isfinite(jac).all() else (np.zeros(0, int), np.zeros(0))
         if len(at):
             nums = _examined(disc, nums, jac, np.asarray(own), np.asarray(points), at, least)
     if not all(map(_same, old, (disc.lost, disc.dropped))):

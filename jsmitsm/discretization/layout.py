@@ -77,7 +77,7 @@ class Discretization:
         """Fields that the problem determines only up to a constant: no value of theirs enters."""
         zero = (0,) * self.rec.dim
         values = {f for f, b in (*self.rec.slots, *self.scheme.own) if b == zero}
-        return tuple(f for f in range(self.rec.fields) if f not in values) if self.linear else ()
+        return tuple(f for f in range(self.rec.fields) if f not in values)
 
     @property
     def active(self) -> np.ndarray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from typing import Any
 
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.cloud.neighbours import Stencils
@@ -79,21 +80,40 @@ def solve(
     >>> bool(abs(sol.u - (cloud.points[:, 0] ** 5 / 20 + 2 * cloud.points[:, 0] + 1)).max() < 1e-12)
     True
     """
+    run = prepared(
+        problem, cloud, method=method, order=order, kernel=kernel, stencils=stencils, basis_terms=basis_terms,
+        formulation=formulation, solver=solver, u0=u0, throw=throw, depth=depth,
+    )  # fmt: skip
+    if run.disc.linear:
+        values, good = run.step(numbers(run.disc, problem))
+        return finished(run, values, None, good, 1)
+    return finished(run, *newton(run, u0))
+
+
+def prepared(
+    problem: Problem, cloud: Cloud, *, method: str = "S", order: int = 4, kernel: Kernel | None = None,
+    stencils: Stencils | None = None, basis_terms: int | None = None, formulation: str = "auto", solver: str = "auto",
+    u0: Any = None, throw: bool = True, depth: Depth = 0,
+) -> Run:  # fmt: skip
+    """Checked arguments of :func:`solve`, discretised."""
     start = time.perf_counter()
     check(problem, cloud, method, order, kernel, stencils, formulation, solver, u0, throw, depth)
     disc = discretize(problem, cloud, method, order, kernel, stencils, basis_terms, sources=False, depth=depth)
     run = Run(disc, problem, solver, throw, kernel is None and stencils is None, formulation)
-    run.seconds["set-up"] = time.perf_counter() - start
+    run.began, run.seconds["set-up"] = start, time.perf_counter() - start
     if not disc.classes:
         raise ValueError("problem: every particle's value is held; nothing is left to solve for")
-    if disc.linear:
-        nums = numbers(disc, problem)
-        values, good = run.step(nums)
-        taylor, iterations = None, 1
-    else:
-        values, taylor, good, iterations = newton(run, u0)
-    run.seconds["total"] = time.perf_counter() - start
-    recipe = Recipe(method, order, basis_terms, run.formulation, problem.fields, disc.rec.depth)
-    fit = Fit(problem, cloud, disc.kernel, table(disc), taylor, recipe)
+    return run
+
+
+def finished(run: Run, values: Any, taylor: Any, good: Any, iterations: Any) -> Solution:
+    """The solution of a run that ended with these values and expansions (None: a linear problem)."""
+    disc, scheme = run.disc, run.disc.scheme
+    run.seconds["total"] = time.perf_counter() - run.began
+    recipe = Recipe(
+        scheme.method, disc.rec.order, disc.basis_terms, run.formulation, disc.rec.fields,
+        disc.rec.depth,
+    )
+    fit = Fit(run.problem, disc.cloud, disc.kernel, table(disc), taylor, recipe)
     report = None if is_traced(values) else run
-    return Solution(values, cloud, recipe, fit, good, iterations, run.stats(), report=report)
+    return Solution(values, disc.cloud, recipe, fit, good, iterations, run.stats(), report=report)
