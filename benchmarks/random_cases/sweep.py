@@ -16,6 +16,8 @@ from benchmarks.random_cases.cases import MEMBERS, case
 from benchmarks.random_cases.judging import BETWEEN, FLOOR, KINDS, RIGHT, WRONG, attempt, counts, effectivity, judged
 
 DATA = Path(__file__).parent.parent / "data" / "random.json"
+# So many cases make the sweep.
+WHOLE = 4000
 CLASSES, METHODS = ("linear", "nonlinear", "system"), ("S", "I", "II", "III", "SSPH")
 
 
@@ -63,12 +65,14 @@ def judgement(records: list[dict[str, Any]], seed: int) -> dict[str, Any]:
     machine = describe()
     right = sum(r["kind"] in ("accurate", "right, yet flagged") for r in records)
     needless = sum(r["kind"] == "right, yet flagged" for r in records)
+    kinds = ", ".join(f"{sum(r['class'] == name for r in records)} {name}" for name in CLASSES)
+    part = f"These are the first of {WHOLE} cases, the rest has not run: " if len(records) < WHOLE else "Of these cases "
     note = (
         f"`python -m benchmarks.stability --random --seed {seed} --cases {len(records)}` on {machine['processor']}, "
-        f"JAX {machine['jax']}: random operators of first to fourth order with variable and steep coefficients, "
+        f"JAX {machine['jax']}: drawn from operators of first to fourth order with variable and steep coefficients, "
         "nonlinear ones and systems, on intervals, boxes, stars, balls, shapes with notches and holes, lattices to "
         "random clouds, conditions of every kind, orders 2 to 8, solutions from smooth to narrower than the spacing, "
-        "in float64. "
+        f"in float64. {part}{kinds}, {sum(r['dim'] == 3 for r in records)} in 3D. "
         f"*Wrong*: an error above {WRONG:.0%} (relative L2, of the worst field); *accurate*: below {RIGHT:.0%}. "
         f"Flagged are {needless} of the {right} solutions with an error below {RIGHT:.0%} "
         f"({needless / max(right, 1):.1%})."
