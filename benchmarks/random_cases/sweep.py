@@ -66,7 +66,7 @@ def judgement(records: list[dict[str, Any]], seed: int) -> dict[str, Any]:
     right = sum(r["kind"] in ("accurate", "right, yet flagged") for r in records)
     needless = sum(r["kind"] == "right, yet flagged" for r in records)
     kinds = ", ".join(f"{sum(r['class'] == name for r in records)} {name}" for name in CLASSES)
-    part = f"These are the first of {WHOLE} cases, the rest has not run: " if len(records) < WHOLE else "Of these cases "
+    part = f"The first of {WHOLE} cases, the rest has not run: " if len(records) < WHOLE else "Of these cases "
     note = (
         f"`python -m benchmarks.stability --random --seed {seed} --cases {len(records)}` on {machine['processor']}, "
         f"JAX {machine['jax']}: drawn from operators of first to fourth order with variable and steep coefficients, "
