@@ -17,7 +17,7 @@ from jsmitsm.eager import in_one_program, picked
 from jsmitsm.problem import Condition, Problem
 from jsmitsm.taylor import Slot
 from jsmitsm.trace import Traced, trace
-from jsmitsm.tracers import is_traced
+from jsmitsm.tracers import is_traced, owned
 
 
 @dataclass
@@ -67,6 +67,36 @@ class Part:
     n_rows: int
     linear: bool
     numbers: Callable[[Any], tuple[Any, Any]]
+
+
+def closed(problem: Problem, traced: Traced) -> Problem:
+    """The problem as it is now: its functions recorded (``traced`` is its pde's record), its arrays copied.
+
+    What is made of it later, derivatives and estimates, is that of this problem, whatever the user's closures,
+    parameters and arrays have become.
+    """
+    if problem.pde is traced:
+        return problem
+    new = object.__new__(Problem)
+    new.pde, new.fields, new.params = traced, problem.fields, jax.tree.map(owned, problem.params)
+    new.bcs = {
+        name: [_closed_condition(problem, c, traced.dim, f"bcs[{name!r}]") for c in conditions]
+        for name, conditions in problem.bcs.items()
+    }
+    return new
+
+
+def _closed_condition(problem: Problem, c: Condition, dim: int, where: str) -> Condition:
+    components = problem.fields if c.field is None else 1
+
+    def one(name: str, part: Any) -> Any:
+        if not callable(part):
+            return owned(part)
+        if c.kind == "condition":
+            return _recorded_residual(part, dim, problem, where)
+        return _recorded_values(part, dim, problem.params, components, f"{where}.{name}")
+
+    return Condition(c.kind, c.field, **{name: one(name, part) for name, part in c.parts.items()})
 
 
 def group_conditions(problem: Problem, cloud: Cloud, order: int, orders: tuple[int, ...]) -> list[Group]:
@@ -227,7 +257,7 @@ def _component(problem: Problem, points: Any, value: Any, named: int | None, k: 
     n, several = points.shape[0], problem.fields > 1 and named is None
 
     def compute():
-        if callable(value):
+        if callable(value) or isinstance(value, Traced):
             sampled = sample(value, points, problem.params, problem.fields if several else 1, where)
             return sampled[k if several else 0]
         xp = jnp if is_traced(value) or isinstance(value, jax.Array) else np
@@ -242,13 +272,10 @@ def _component(problem: Problem, points: Any, value: Any, named: int | None, k: 
     return compute
 
 
-def sample(function: Callable[..., Any], points: Any, params: Any, components: int, where: str) -> Any:
-    """A user's function of x at all points: (components, n)."""
-    arguments = "x" if params is None else "x, params"
-    with _named(where, f"a function of {arguments} that returns a scalar"):
-        traced = trace(
-            lambda u, x, *p: _shaped(function(x, *p), components, where), points.shape[1], components, params=params
-        )
+def sample(function: Callable[..., Any] | Traced, points: Any, params: Any, components: int, where: str) -> Any:
+    """A user's function of x, or its record, at all points: (components, n)."""
+    recorded = isinstance(function, Traced)
+    traced = function if recorded else _recorded_values(function, points.shape[1], params, components, where)
     _, values = traced.coefficients(points, 0, params=params)
     n = points.shape[0]
     if values is None:
@@ -258,6 +285,18 @@ def sample(function: Callable[..., Any], points: Any, params: Any, components: i
         bad = int(np.flatnonzero(~np.isfinite(np.asarray(values)).all(axis=0))[0])
         raise ValueError(f"{where}: the function returns NaN or infinity, first at x = {np.asarray(points)[bad]}")
     return values
+
+
+def _recorded_values(function: Callable[..., Any], dim: int, params: Any, components: int, where: str) -> Traced:
+    arguments = "x" if params is None else "x, params"
+    with _named(where, f"a function of {arguments} that returns a scalar"):
+        return trace(lambda u, x, *p: _shaped(function(x, *p), components, where), dim, components, params=params)
+
+
+def _recorded_residual(residual: Callable[..., Any], dim: int, problem: Problem, where: str) -> Traced:
+    arguments = "u, x, n" if problem.params is None else "u, x, n, params"
+    with _named(where, f"residual({arguments}) returning a scalar or a vector"):
+        return trace(residual, dim, problem.fields, extras=((dim,),), params=problem.params)
 
 
 @contextmanager
@@ -336,9 +375,7 @@ def _as_column(values: Any) -> Any:
 def _general(problem: Problem, points: Any, normals: Any, c: Condition, where: str) -> Part:
     """A user's residual(u, x, n): its derivatives with respect to the slots by AD."""
     dim, n = points.shape[1], points.shape[0]
-    arguments = "u, x, n" if problem.params is None else "u, x, n, params"
-    with _named(where, f"residual({arguments}) returning a scalar or a vector"):
-        traced: Traced = trace(c.residual, dim, problem.fields, extras=((dim,),), params=problem.params)
+    traced = c.residual if isinstance(c.residual, Traced) else _recorded_residual(c.residual, dim, problem, where)
     if not traced.slots:
         raise ValueError(f"{where}: the residual does not depend on u; a condition must involve the solution")
 

@@ -9,6 +9,7 @@ import jax
 import numpy as np
 
 from jsmitsm.errors import some
+from jsmitsm.tracers import frozen, owned
 
 INTERIOR = "interior"
 # Coordinates beyond this, or all below its inverse, have powers that are no numbers.
@@ -63,7 +64,8 @@ class Cloud:
     ValueError
         For a wrong shape, NaN, overlapping or incomplete groups, duplicate particles.
 
-    A cloud is a pytree: points and normals are leaves, groups are static.
+    A cloud is a pytree: points and normals are leaves, groups are static. It does not change: its arrays are
+    read-only copies, and :meth:`replace` makes another one.
 
     Examples
     --------
@@ -78,6 +80,15 @@ class Cloud:
         self.groups = _checked_groups(groups, len(self.points))
         self.normals = _checked_normals(normals, self.points, self.groups)
         self._spacing: float | None = None
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        # What was solved on a cloud rests on it.
+        if name in ("points", "groups", "normals") and name in self.__dict__:
+            raise AttributeError(f"{name}: a Cloud does not change; make another one, cloud.replace({name}=...) or js.Cloud")
+        object.__setattr__(self, name, value)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update({name: frozen(value) for name, value in state.items()})
 
     @property
     def dim(self) -> int:
@@ -132,7 +143,7 @@ class Cloud:
     @classmethod
     def tree_unflatten(cls, groups, leaves):
         new = object.__new__(cls)
-        new.points, new.normals = leaves
+        new.points, new.normals = map(owned, leaves)
         new.groups = groups
         new._spacing = None
         return new
@@ -174,7 +185,7 @@ def _checked_points(points: Any) -> Any:
             raise ValueError(
                 f"points: {len(same)} duplicate particles, pairs {pairs}; keep one of each (np.unique(points, axis=0))"
             )
-    return points
+    return frozen(points)
 
 
 def _checked_groups(groups: Mapping[str, Any], n: int) -> Groups:
@@ -245,7 +256,7 @@ def _checked_normals(normals: Any, points: Any, groups: Groups) -> Any:
             f"normals: not of unit length at particles {some(bad, most=8)} (length {length[bad[0]]:.3g}); "
             "divide by np.linalg.norm(normals, axis=1, keepdims=True)"
         )
-    return normals
+    return frozen(normals)
 
 
 def _describe_groups(groups: Any) -> str:

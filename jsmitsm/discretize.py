@@ -6,6 +6,7 @@ set up the moment systems, ``globalsystem`` and ``leastsquares`` join them, ``ch
 
 from jsmitsm.character import cell_peclet, mean_spacing, prefers_least_squares, wave_number
 from jsmitsm.globalsystem import matrix, right_side, with_held
+from jsmitsm.heldparticles import held_particles, with_held_expansions
 from jsmitsm.layout import Class, Discretization, discretize, sorted_classes, table
 from jsmitsm.leastsquares import least_squares, least_squares_right_side, misfit
 from jsmitsm.numbers import Numbers, numbers
@@ -24,6 +25,7 @@ __all__ = [
     "class_rows",
     "default_size",
     "discretize",
+    "held_particles",
     "least_squares",
     "least_squares_right_side",
     "matrix",
@@ -38,4 +40,5 @@ __all__ = [
     "table",
     "wave_number",
     "with_held",
+    "with_held_expansions",
 ]

@@ -6,9 +6,10 @@ import inspect
 from dataclasses import dataclass, replace
 from typing import Any
 
+import jax
 import numpy as np
 
-from jsmitsm.boundary import Group, group_conditions, in_words
+from jsmitsm.boundary import Group, closed, group_conditions, in_words
 from jsmitsm.clouds import Cloud
 from jsmitsm.kernels import Constant, Kernel
 from jsmitsm.moments import Scheme
@@ -19,7 +20,7 @@ from jsmitsm.program import at_hand
 from jsmitsm.recursion import Recursion, free_indices, recursion
 from jsmitsm.supports import check_supports, cut_off, default_kernel, find_stencils
 from jsmitsm.trace import Traced, trace
-from jsmitsm.tracers import is_traced
+from jsmitsm.tracers import is_traced, owned
 
 
 @dataclass
@@ -40,6 +41,7 @@ class Class:
 class Discretization:
     """What is static about a problem on a cloud: decided once, on the host."""
 
+    problem: Problem  # closed: nothing of it is the user's any more
     cloud: Cloud
     kernel: Kernel | None
     stencils: Stencils
@@ -98,6 +100,8 @@ def discretize(
     """
     traced = _traced(problem, cloud.dim)
     _check_operator(traced, problem, order)
+    problem = closed(problem, traced)
+    kernel, stencils = jax.tree.map(owned, (kernel, stencils))
     rec = recursion(cloud.dim, order, problem.fields, traced.slots, traced.pattern, traced.order)
     groups = group_conditions(problem, with_corners(problem, cloud), order, traced.order)
     held = np.zeros((len(cloud), problem.fields), bool)
@@ -137,7 +141,7 @@ def discretize(
     if kernel is None and method in ("I", "II"):
         kernel = default_kernel(cloud.points, np.arange(len(cloud)), stencils.indices)
     disc = Discretization(
-        cloud, kernel, stencils, traced, rec, groups, scheme, [], held, partner, images, n_own, given_stencils,
+        problem, cloud, kernel, stencils, traced, rec, groups, scheme, [], held, partner, images, n_own, given_stencils,
         basis_terms,
     )  # fmt: skip
     if given_stencils or kernel is not None:
@@ -236,6 +240,8 @@ def crowded(group: Group, rec: Recursion) -> bool:
 
 def _traced(problem: Problem, dim: int) -> Traced:
     """The residual recorded; whatever goes wrong in it is said to be the pde's."""
+    if isinstance(problem.pde, Traced):
+        return problem.pde
     expected = "pde(u, x)" if problem.params is None else "pde(u, x, params)"
     try:
         inspect.signature(problem.pde).bind(*([None] * (2 if problem.params is None else 3)))

@@ -15,6 +15,7 @@ from jsmitsm.elementwise import ELEMENTWISE
 from jsmitsm.jaxprs import EVERYTHING, bind, called, levels, literal
 from jsmitsm.operators import Field, LocalField, field_p, frozen_p
 from jsmitsm.taylor import Slot
+from jsmitsm.tracers import owned
 
 # What a value of the traced residual is to the point: the point itself, dependent on it, or not.
 POINT, DEPENDENT, FREE = 2, 1, 0
@@ -352,7 +353,9 @@ def record(
         constvars=[*jaxpr.constvars, *jaxpr.invars[len(jaxpr.invars) - n :]],
         invars=jaxpr.invars[: len(jaxpr.invars) - n],
     )
-    return Record(jaxpr, (*third.consts, *first.consts), ordered, tuple(outputs), flat.outvars[0].aval.shape[0])
+    # What the residual closes over may be changed in place later: a record holds copies.
+    consts = tuple(map(owned, (*third.consts, *first.consts)))
+    return Record(jaxpr, consts, ordered, tuple(outputs), flat.outvars[0].aval.shape[0])
 
 
 def _shaped(v: Any) -> jax.ShapeDtypeStruct:

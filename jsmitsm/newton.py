@@ -53,7 +53,7 @@ def _advance(run: Run, taylor: Any) -> tuple[Any, Any]:
     """One full Newton step from the expansions."""
     nums = dz.numbers(run.disc, run.problem, taylor)
     values, _ = run.step(nums)
-    return values, dz.all_coefficients(run.disc, nums, values)
+    return values, dz.with_held_expansions(run.disc, dz.all_coefficients(run.disc, nums, values))
 
 
 def _iterate(

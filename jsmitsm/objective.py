@@ -188,7 +188,7 @@ class Objective:
         else:
             values, taylor, good, iterations = newton(run, self.values)
         recipe = Recipe(o["method"], o["order"], o.get("basis_terms"), run.formulation, self.problem.fields)
-        fit = Fit(self.problem, self.cloud, kernel, dz.table(disc), taylor, recipe)
+        fit = Fit(disc.problem, self.cloud, kernel, dz.table(disc), taylor, recipe)
         found = Solution(values, self.cloud, recipe, fit, good, iterations, {})
         return found, *run.seen
 

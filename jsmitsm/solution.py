@@ -14,7 +14,7 @@ import numpy as np
 from jsmitsm.clouds import Cloud
 from jsmitsm.errors import SolveError
 from jsmitsm.polynomials import derivative_table, monomials
-from jsmitsm.tracers import is_traced
+from jsmitsm.tracers import frozen, is_traced
 
 # An estimated error above this part of the solution is a flag.
 LARGE = 0.1
@@ -70,7 +70,7 @@ class Solution:
     """
 
     def __init__(self, values, cloud, recipe, fit, converged, iterations, stats, fitted=None, report=None):
-        self._values = values  # (N, F)
+        self._values = frozen(values)  # (N, F)
         self.cloud: Cloud = cloud
         self._recipe: Recipe = recipe
         self._fit = fit  # a pytree with a method .coefficients(values) and friends
@@ -121,7 +121,7 @@ class Solution:
             fitted = self._fit.coefficients(self._values)
             if is_traced(fitted):
                 return fitted
-            self._fitted = fitted
+            self._fitted = frozen(fitted)
         return self._fitted
 
     def __call__(self, points: Any, *, blend: bool = False) -> Any:
@@ -278,9 +278,12 @@ class Solution:
         return new
 
     def __getstate__(self):
-        # The user's functions need not pickle: what they give, the local polynomials, does.
+        # Records need not pickle: what they give, the local polynomials, does.
         fitted = jax.tree.map(np.asarray, self._taylor)
         return {**self.__dict__, "_fit": None, "_fitted": fitted, "_found": self.flags, "_report": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update({name: frozen(value) for name, value in state.items()})
 
 
 def _checked_points(points: Any, dim: int) -> Any:

@@ -6,6 +6,7 @@ import time
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm import discretize as dz
@@ -45,11 +46,19 @@ class Fit:
     @bar("fitting")
     def coefficients(self, values: Any) -> Any:
         """Taylor coefficients (N, F, K) of every particle."""
-        disc = self.discretization()
-        disc.classes = dz.sorted_classes(
-            disc, np.flatnonzero(disc.partner == np.arange(len(self.cloud))), disc.stencils
-        )
-        nums = dz.numbers(disc, self.problem, self.taylor, everywhere=True)
+        disc, taylor = self.discretization(), self.taylor
+        held = dz.held_particles(disc)
+        if taylor is not None and len(held):
+            # Those of held particles are continued from others; fitted where that is linearised they are their own.
+            alone = np.isin(disc.partner, held)[:, None, None]
+            fitted = self._fitted(disc, held, taylor, values)
+            taylor = (jnp if is_traced(fitted, taylor) else np).where(alone, fitted, taylor)
+        return self._fitted(disc, np.flatnonzero(disc.partner == np.arange(len(self.cloud))), taylor, values)
+
+    def _fitted(self, disc: Discretization, ids: np.ndarray, taylor: Any, values: Any) -> Any:
+        """Taylor coefficients (N, F, K) of the particles ``ids`` alone, linearised at ``taylor``."""
+        disc.classes = dz.sorted_classes(disc, ids, disc.stencils)
+        nums = dz.numbers(disc, self.problem, taylor, everywhere=True)
         return dz.all_coefficients(disc, nums, values)
 
     def tree_flatten(self):
@@ -116,6 +125,7 @@ def solve(
     start = time.perf_counter()
     check(problem, cloud, method, order, kernel, stencils, formulation, solver, u0, throw)
     disc = dz.discretize(problem, cloud, method, order, kernel, stencils, basis_terms, sources=False)
+    problem = disc.problem
     run = Run(disc, problem, solver, throw, kernel is None and stencils is None, formulation)
     run.seconds["set-up"] = time.perf_counter() - start
     if not disc.classes:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -32,9 +32,13 @@ CHUNK = 4096
 COMPILATIONS = 0
 
 
+@jax.tree_util.register_pytree_node_class
 @dataclass(frozen=True, eq=False)
 class Traced:
     """The record of a residual r(x, d^b u, extras, params) of E equations in S slots.
+
+    It is closed: the residual's function is not called again, and the arrays it closed over are copies. A pytree,
+    whose leaves are those of floats.
 
     ``slots``: the (field, multi-index) pairs whose coefficient is not identically zero, graded.
     ``pattern`` (E, S) bool: which equation holds which slot.  ``order``: per equation the highest
@@ -57,6 +61,25 @@ class Traced:
     _record: Record = field(repr=False)
     _n_extras: int = field(repr=False)
     _params_tree: Any = field(repr=False)
+
+    def tree_flatten(self) -> tuple[Any, _Form]:
+        return tuple(self._record.consts[k] for k in self._form.moving), self._form
+
+    @classmethod
+    def tree_unflatten(cls, form: _Form, leaves: Any) -> Traced:
+        consts = list(form.traced._record.consts)
+        for k, leaf in zip(form.moving, leaves, strict=True):
+            consts[k] = leaf
+        new = replace(form.traced, _record=form.traced._record._replace(consts=tuple(consts)))
+        new.__dict__["_form"] = form
+        return new
+
+    @cached_property
+    def _form(self) -> _Form:
+        consts = self._record.consts
+        moving = tuple(k for k, c in enumerate(consts) if not _is_fixed(c))
+        rest = self._record._replace(consts=tuple(None if k in moving else c for k, c in enumerate(consts)))
+        return _Form(replace(self, _record=rest), moving)
 
     def coefficients(
         self, points: Any, degree: int, *, extras: Sequence[Any] = (), params: Any = None, slots: Any = None
@@ -218,6 +241,29 @@ class Traced:
         return kept(key, lambda: in_one_program(compute))(moving)
 
 
+class _Form:
+    """What is static of a record: all but the arrays ``moving`` of its constants. Equal where the same is computed."""
+
+    def __init__(self, traced: Traced, moving: tuple[int, ...]):
+        self.traced, self.moving = traced, moving
+
+    @cached_property
+    def _key(self) -> Any:
+        t = self.traced
+        fixed = tuple(None if c is None else (c.dtype.str, c.shape, c.tobytes()) for c in map(_host, t._record.consts))
+        return t._fingerprint, fixed, self.moving, t.dim, t.fields, t.slots, t._n_extras, t._params_tree
+
+    def __eq__(self, other: object) -> bool:
+        return self is other or (isinstance(other, _Form) and self._key == other._key)
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+
+def _host(const: Any) -> Any:
+    return None if const is None else np.asarray(const)
+
+
 @jax.tree_util.register_pytree_node_class
 @dataclass
 class _Inputs:
@@ -258,6 +304,11 @@ class _Inputs:
 
 def _zeros(value: Any) -> np.ndarray:
     return np.zeros(np.shape(value), getattr(value, "dtype", float))
+
+
+def _is_fixed(const: Any) -> bool:
+    """Whether a constant is part of what is computed: integers and truth values that are not traced."""
+    return not isinstance(const, jax.core.Tracer) and not jnp.issubdtype(const.dtype, jnp.inexact)
 
 
 def _is_structure(const: Any) -> bool:
