@@ -75,7 +75,7 @@ def times(side: int) -> dict:
     import jax
     from jax.interpreters import mlir
 
-    from jsmitsm import linsolve
+    from jsmitsm.linear import linsolve
 
     scene, compiled, callbacks = Scene(side), [], []
     jax.monitoring.register_event_duration_secs_listener(

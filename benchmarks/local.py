@@ -22,9 +22,10 @@ import jax.numpy as jnp
 import jsmitsm as js
 from benchmarks import machine
 from benchmarks.commandline import arguments
-from jsmitsm import discretize as dz
-from jsmitsm import onekernel
-from jsmitsm.solve import discretized
+from jsmitsm.discretization.rows import all_rows
+from jsmitsm.discretization.coefficients import numbers
+from jsmitsm.runtime import one_kernel
+from jsmitsm.solution.arguments import discretized
 
 DATA = Path(__file__).parent / "data" / "local.json"
 REPEATS = 15
@@ -53,13 +54,13 @@ def microseconds(dim: int, order: int, size: int, side: int, variable: bool, man
     # A tie in one particle of thousands would make all stencils wider.
     exactly = replace(found, indices=found.indices[:, :size])
     disc = discretized(posed, cloud, "S", order, None, exactly)
-    nums: Any = dz.numbers(disc, posed)
+    nums: Any = numbers(disc, posed)
     if many:
-        onekernel.available = lambda: False
+        one_kernel.available = lambda: False
     took = []
     for _ in range(REPEATS):
         start = time.perf_counter()
-        dz.all_rows(disc, nums)
+        all_rows(disc, nums)
         took.append(time.perf_counter() - start)
     return 1e6 * min(took) / len(disc.active)
 

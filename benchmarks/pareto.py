@@ -27,7 +27,7 @@ from benchmarks import machine, peers
 from benchmarks.commandline import arguments
 from benchmarks.problems import CASES, Case
 from benchmarks.problems.shapes import conducting
-from jsmitsm.simplices import simplices
+from jsmitsm.cloud.triangulation import simplices
 
 DATA = Path(__file__).parent / "data" / "pareto.json"
 PICTURE = Path(__file__).parent.parent / "docs" / "images" / "pareto.png"

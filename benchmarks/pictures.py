@@ -7,8 +7,6 @@ import matplotlib
 import numpy as np
 
 import jsmitsm as js
-import jsmitsm.plot
-import jsmitsm.sdf
 from benchmarks.commandline import arguments
 from benchmarks.problems import CASES
 

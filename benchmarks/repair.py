@@ -19,8 +19,10 @@ from benchmarks import stability as st
 from benchmarks.commandline import arguments
 from benchmarks.machine import describe
 from benchmarks.problems.families import at_home, smooth
-from jsmitsm import discretize as dz
-from jsmitsm import health
+from jsmitsm.discretization.rows import all_rows
+from jsmitsm.discretization.layout import discretize
+from jsmitsm.discretization.coefficients import numbers
+from jsmitsm.discretization import health
 
 DATA = Path(__file__).parent / "data" / "repair.json"
 
@@ -58,7 +60,7 @@ def error(sol, task):
 def compared(name, task, cloud):
     """Errors as found and as repaired, and how many stencils were repaired and stay weak."""
     repaired = js.solve(task, cloud)
-    disc = dz.discretize(task, cloud, "S", 4, None, None, None)
+    disc = discretize(task, cloud, "S", 4, None, None, None)
     try:
         plain = js.solve(task, cloud, stencils=disc.stencils)
         found = [error(plain, task), plain.stats["lebesgue_max"]]
@@ -71,9 +73,9 @@ def compared(name, task, cloud):
 def cost(n=200):
     """Seconds of the local phase of n^2 particles, and of looking through their Lebesgue constants."""
     task, cloud = st.problem("poisson", 2, at_home(2)), st.lattice(2, 0.3, shape=(n, n))
-    disc = dz.discretize(task, cloud, "S", 4, None, None, None)
-    nums = dz.numbers(disc, task)
-    classes, rows = dz.all_rows(disc, nums)
+    disc = discretize(task, cloud, "S", 4, None, None, None)
+    nums = numbers(disc, task)
+    classes, rows = all_rows(disc, nums)
 
     def seconds(call):
         took = []
@@ -83,7 +85,7 @@ def cost(n=200):
             took.append(time.perf_counter() - start)
         return min(took)
 
-    return seconds(lambda: dz.all_rows(disc, nums)), seconds(lambda: health.examine(classes, rows))
+    return seconds(lambda: all_rows(disc, nums)), seconds(lambda: health.examine(classes, rows))
 
 
 def main():

@@ -22,10 +22,16 @@ import numpy as np
 import jsmitsm as js
 from benchmarks import machine
 from benchmarks.commandline import arguments
-from jsmitsm import assembly, linsolve, repeats, rows
-from jsmitsm import discretize as dz
-from jsmitsm.solve import discretized
-from jsmitsm.taylor import count
+from jsmitsm.particle import batches
+from jsmitsm.linear import linsolve
+from jsmitsm.discretization import repeated_stencils
+from jsmitsm.discretization import rows
+from jsmitsm.discretization.rows import all_rows
+from jsmitsm.discretization.layout import discretize
+from jsmitsm.discretization.coefficients import numbers
+from jsmitsm.discretization.layout import sorted_classes
+from jsmitsm.solution.arguments import discretized
+from jsmitsm.taylor.multi_indices import count
 
 DATA = Path(__file__).parent / "data" / "skipping.json"
 REPEATS = 9
@@ -84,8 +90,8 @@ def local(problem: Callable[[], js.Problem], cloud: Callable[[int], js.Cloud], o
         return _weights(*ready[k])
 
     for k in range(REPEATS + 1):
-        disc = dz.discretize(problem(), cloud(k), "S", order, None, None, None, **options)
-        ready[k] = disc, dz.numbers(disc, problem())
+        disc = discretize(problem(), cloud(k), "S", order, None, None, None, **options)
+        ready[k] = disc, numbers(disc, problem())
     return run
 
 
@@ -110,7 +116,7 @@ def lines() -> Iterator[tuple[str, str, float, float]]:
     yield "weights of a source that is zero", "local phase, variable coefficients", *both(
         local(conducting, scattered, order, sources=False), local(conducting, scattered, order))
     yield "moment systems of repeated stencils", "local phase on a lattice, order 8", *both(
-        local(poisson, lattice, 8), patched(local(poisson, lattice, 8), mock.patch.object(repeats, "FEWEST", 10**9)))
+        local(poisson, lattice, 8), patched(local(poisson, lattice, 8), mock.patch.object(repeated_stencils, "FEWEST", 10**9)))
     yield "rows of Dirichlet particles", *_held_rows()
 
     def solve(k: int) -> Any:
@@ -132,7 +138,7 @@ def lines() -> Iterator[tuple[str, str, float, float]]:
 def _for_each(order: int) -> Callable[[int], Any]:
     """The local phase as if the operator's coefficients varied."""
     disc = discretized(laplace(), scattered(0), "S", order)
-    nums = dz.numbers(disc, laplace())
+    nums = numbers(disc, laplace())
     nums.jac = np.broadcast_to(nums.jac, (*nums.jac.shape[:2], 1, len(nums.ids)))
     nums.jac = np.concatenate([nums.jac, np.zeros((*nums.jac.shape[:2], count(2, disc.rec.degree) - 1, len(nums.ids)))], 2)
     return lambda k: _weights(disc, nums)
@@ -144,21 +150,21 @@ def _held_rows() -> tuple[str, float, float]:
     posed = js.Problem(lambda u, x: js.laplacian(u)(x) - 1.0, dict.fromkeys(
         (*SIDES, "front", "back"), js.dirichlet(0.0)))  # fmt: skip
     disc, every = (discretized(posed, cloud, "S", 4) for _ in range(2))
-    every.classes = dz.sorted_classes(every, np.arange(len(cloud)), every.stencils)
-    nums = dz.numbers(disc, posed)
+    every.classes = sorted_classes(every, np.arange(len(cloud)), every.stencils)
+    nums = numbers(disc, posed)
     where = f"local phase, {len(cloud) - len(disc.active)} of {len(cloud)} particles"
     return where, *both(lambda k: _weights(disc, nums), lambda k: _weights(every, nums))
 
 
 def _weights(disc: Any, nums: Any) -> Any:
-    return [row.weights for row in dz.all_rows(disc, nums)[1]]
+    return [row.weights for row in all_rows(disc, nums)[1]]
 
 
 def _rows_of(method: str) -> Callable[[int], Any]:
     cloud = scattered(0)
     kernel = js.Gaussian(h=2.0 * SPACING, d=2.0)
     disc = discretized(laplace(), cloud, method, 4, kernel)
-    nums = dz.numbers(disc, laplace())
+    nums = numbers(disc, laplace())
     return lambda k: _weights(disc, nums)
 
 

@@ -28,7 +28,7 @@ import jsmitsm as js
 from benchmarks import scenes
 from benchmarks.machine import describe
 from benchmarks.problems.families import FAMILIES, at_home
-from jsmitsm.neighbours import Stencils
+from jsmitsm.cloud.neighbours import Stencils
 
 DATA = Path(__file__).parent / "data" / "stability.json"
 

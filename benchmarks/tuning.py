@@ -26,7 +26,7 @@ import jsmitsm as js
 from benchmarks.commandline import arguments
 from benchmarks.machine import describe
 from benchmarks.problems import CASES, Case, laplace
-from jsmitsm.objective import nearest_distance, reference
+from jsmitsm.tuning.objective import nearest_distance, reference
 
 DATA = Path(__file__).parent / "data" / "tuning.json"
 STARTS = (0.7, 2.0)

@@ -3,17 +3,17 @@
 from importlib import import_module
 from typing import Any
 
-from jsmitsm.clouds import Cloud, box, interval, rectangle
-from jsmitsm.errors import SolveError
-from jsmitsm.estimate import Factorization, factorize
-from jsmitsm.kernels import Constant, CubicSpline, Gaussian, Kernel, SuperGaussian, Wendland
-from jsmitsm.neighbours import Stencils, stencils
-from jsmitsm.operators import divergence, grad, hessian, laplacian, partial
-from jsmitsm.problem import Condition, Problem, condition, dirichlet, fix, free, neumann, periodic, robin
-from jsmitsm.progress import no_progress
-from jsmitsm.solution import Solution
-from jsmitsm.solve import solve
-from jsmitsm.taylor import multi_indices
+from jsmitsm.cloud.cloud import Cloud, box, interval, rectangle
+from jsmitsm.cloud.neighbours import Stencils, stencils
+from jsmitsm.equation.operators import divergence, grad, hessian, laplacian, partial
+from jsmitsm.equation.problem import Condition, Problem, condition, dirichlet, fix, free, neumann, periodic, robin
+from jsmitsm.particle.kernels import Constant, CubicSpline, Gaussian, Kernel, SuperGaussian, Wendland
+from jsmitsm.runtime.errors import SolveError
+from jsmitsm.runtime.progress import no_progress
+from jsmitsm.solution.factorization import Factorization, factorize
+from jsmitsm.solution.solution import Solution
+from jsmitsm.solution.solve import solve
+from jsmitsm.taylor.multi_indices import multi_indices
 
 __version__ = "0.1.0"
 
@@ -26,25 +26,28 @@ __all__ = [
 ]  # fmt: skip
 
 # Imported when first used: they need more than solving does.
-_LAZY_MODULES = ("files", "plot", "sdf")
-_LAZY_NAMES = {
-    "Quality": "evenness",
-    "TuneResult": "tuning",
-    "continuation": "stages",
-    "from_polygon": "shapes",
-    "from_sdf": "shapes",
-    "quadrature": "boundary_quadrature",
-    "quality": "evenness",
-    "show_versions": "versions",
-    "tune": "tuning",
+_LAZY = {
+    "Quality": "cloud.quality",
+    "TuneResult": "tuning.tune",
+    "continuation": "solution.continuation",
+    "files": "show",
+    "from_polygon": "cloud.shapes",
+    "from_sdf": "cloud.shapes",
+    "plot": "show",
+    "quadrature": "cloud.quadrature",
+    "quality": "cloud.quality",
+    "sdf": "cloud",
+    "show_versions": "runtime.versions",
+    "tune": "tuning.tune",
 }
+_MODULES = ("files", "plot", "sdf")
 
 
 def __getattr__(name: str) -> Any:
-    if name in _LAZY_MODULES:
-        return import_module(f"jsmitsm.{name}")
-    if name in _LAZY_NAMES:
-        return getattr(import_module(f"jsmitsm.{_LAZY_NAMES[name]}"), name)
+    if name in _MODULES:
+        return import_module(f"jsmitsm.{_LAZY[name]}.{name}")
+    if name in _LAZY:
+        return getattr(import_module(f"jsmitsm.{_LAZY[name]}"), name)
     raise AttributeError(f"module 'jsmitsm' has no attribute {name!r}")
 
 

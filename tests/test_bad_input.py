@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import jsmitsm as js
+from jsmitsm.solution.fit import Recipe
 
 # No warning of numpy's about its own arithmetic reaches the user: the error says what is wrong.
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
@@ -48,7 +49,7 @@ def ends(left=ENDS["left"], right=ENDS["right"], **rest):
 
 
 def evaluate(call):
-    sol = js.Solution(np.zeros((9, 1)), LINE, js.solution.Recipe("S", 2, None, "auto", 1), None, True, 1, {},
+    sol = js.Solution(np.zeros((9, 1)), LINE, Recipe("S", 2, None, "auto", 1), None, True, 1, {},
                       fitted=np.zeros((9, 1, 3)))  # fmt: skip
     return lambda: call(sol)
 
@@ -375,7 +376,7 @@ RESIDUALS = [
     ("zero-coefficient", residual(lambda u, x: 0.0 * js.laplacian(u)(x) + x[0]), "pde", r"u\(x\)"),
 ]
 
-FLOW = js.Solution(np.zeros((25, 1)), SQUARE, js.solution.Recipe("S", 2, None, "auto", 1), None, True, 1, {},
+FLOW = js.Solution(np.zeros((25, 1)), SQUARE, Recipe("S", 2, None, "auto", 1), None, True, 1, {},
                    fitted=np.zeros((25, 1, 6)))  # fmt: skip
 EVALUATION = [
     ("flat", evaluate(lambda s: s(np.zeros(3))), "points:", r"\(M, 1\)"),

@@ -4,7 +4,7 @@ import gc
 
 import pytest
 
-from jsmitsm.collector import uncollected
+from jsmitsm.runtime.collector import uncollected
 
 
 @pytest.mark.parametrize("on", [True, False])

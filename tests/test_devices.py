@@ -17,8 +17,8 @@ ON_THE_SECOND = """
 import jax; jax.config.update("jax_enable_x64", True)
 import jax.numpy as jnp, numpy as np
 import jsmitsm as js
-from jsmitsm import pieces
-pieces.PIECE = 32  # in pieces, side by side
+from jsmitsm.discretization import sharing
+sharing.PIECE = 32  # in pieces, side by side
 ends = dict.fromkeys(("left", "right", "bottom", "top"), js.dirichlet(0.0))
 cloud = js.rectangle((0, 0), (1, 1), (13, 13), jitter=0.2)
 problem = lambda c: js.Problem(lambda u, x: js.laplacian(u)(x) + c * jnp.exp(x[0]), ends)

@@ -11,7 +11,7 @@ import pytest
 import jsmitsm
 
 DOCS = Path(__file__).parent.parent / "docs"
-MODULES = sorted(m.name for m in pkgutil.iter_modules(jsmitsm.__path__))
+MODULES = sorted(m.name for m in pkgutil.walk_packages(jsmitsm.__path__, "jsmitsm."))
 
 
 @pytest.fixture(autouse=True)
@@ -33,7 +33,7 @@ def test_blocks_of_a_page_run(page, capsys, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("name", MODULES)
 def test_examples_in_docstrings(name):
-    module = importlib.import_module(f"jsmitsm.{name}")
+    module = importlib.import_module(name)
     result = doctest.testmod(module, optionflags=doctest.NORMALIZE_WHITESPACE)
     assert result.failed == 0
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import jsmitsm as js
-from jsmitsm import eager
-from jsmitsm.eager import called, in_one_program
+from jsmitsm.runtime import whole_program
+from jsmitsm.runtime.whole_program import called, in_one_program
 
 X = {"x": np.array([0.3, -0.4, 1.2]), "scale": 1.5}
 OPTIONS = (("xla_backend_optimization_level", 0),)
@@ -87,7 +87,7 @@ def test_a_result_that_does_not_move_has_no_derivative():
     """Otherwise what follows would be differentiated in vain."""
     arguments = {"index": np.array([0]), "scale": 1.5, "x": X["x"]}
     tree = jax.tree.structure(arguments)
-    result = eager._whole(plain, (("power", 3),), tree, OPTIONS, False).result(eager._avals(arguments.values()))
+    result = whole_program._whole(plain, (("power", 3),), tree, OPTIONS, False).result(whole_program._avals(arguments.values()))
     names = sorted(plain(*(arguments[k] for k in ("x", "scale", "index")), 3))
     reached = {name: [names[k] for k in result.reached([k])] for k, name in enumerate(arguments)}
     assert reached == {"index": ["all"], "scale": ["all", "scale"], "x": ["all"]}

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import jsmitsm as js
-from jsmitsm import assembly, linsolve
+from jsmitsm.particle import batches
+from jsmitsm.linear import linsolve
 
 SIDES = ("left", "right", "bottom", "top")
 CLOUD = js.rectangle((0, 0), (1, 1), (17, 17), jitter=0.2)
@@ -34,9 +35,9 @@ def test_it_follows_the_form_that_solve_chooses(problem, form):
     """Another source and other values: the same numbers as a solve, without a new local phase or factorisation."""
     ready = js.factorize(problem(1.0), CLOUD)
     first = ready.solve(problem(1.0))
-    made, traced = linsolve.factorisations(), assembly.TRACES["rows"]
+    made, traced = linsolve.factorisations(), batches.TRACES["rows"]
     second = ready.solve(problem(-3.0, 0.5))
-    assert (made, traced) == (linsolve.factorisations(), assembly.TRACES["rows"])
+    assert (made, traced) == (linsolve.factorisations(), batches.TRACES["rows"])
     for sol, task in ((first, problem(1.0)), (second, problem(-3.0, 0.5))):
         own = js.solve(task, CLOUD)
         assert sol.stats["formulation"] == own.stats["formulation"] == form

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 import jsmitsm as js
-from jsmitsm.files import from_csv, from_mesh, from_shapely, to_csv, to_mesh, to_pandas, to_xarray
-from jsmitsm.shapes import from_polygon
-from jsmitsm.simplices import simplices
+from jsmitsm.show.files import from_csv, from_mesh, from_shapely, to_csv, to_mesh, to_pandas, to_xarray
+from jsmitsm.cloud.shapes import from_polygon
+from jsmitsm.cloud.triangulation import simplices
 
 meshio = pytest.importorskip("meshio")
 

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 import jsmitsm as js
-from jsmitsm import linsolve
-from jsmitsm.assembly import QUICKLY
+from jsmitsm.linear import linsolve
+from jsmitsm.particle.batches import QUICKLY
 
 STEP = 5e-5
 BOUND = 1e-6

@@ -12,6 +12,8 @@ jax.config.update("jax_enable_x64", True)
 import jax.numpy as jnp
 import numpy as np
 import jsmitsm as js
+from jsmitsm.linear import linsolve
+from jsmitsm.runtime.interrupts import interruptible
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored from the start in a background job of a shell
 SIDES = ("left", "right", "bottom", "top")
@@ -33,7 +35,7 @@ def interrupted(call, after):
     # Python itself loses an interrupt that falls into the callback of a weak reference or of a garbage collection, of
     # which JAX has many.
     for attempt in range(8):
-        js.linsolve.clear_cache()
+        linsolve.clear_cache()
         threading.Timer(after, press).start()
         try:
             call()
@@ -49,7 +51,7 @@ for after in (0.02, 0.05, 0.1, 0.2):  # in the search, the local fits, the assem
     print("solve", interrupted(lambda: js.solve(problem, large), after))
     right()
 # Stands for a factorisation, during which Python does not look at signals.
-print("factorisation", interrupted(lambda: js.interrupts.interruptible(lambda: time.sleep(20)), 0.3))
+print("factorisation", interrupted(lambda: interruptible(lambda: time.sleep(20)), 0.3))
 print("tune", interrupted(lambda: js.tune(problem, small, kernel, steps=10**5), 0.2))
 right()
 sys.stdout.flush()

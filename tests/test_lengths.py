@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jsmitsm as js
-from jsmitsm import operands
+from jsmitsm.discretization import local_data
 
 
 def exact(x):
@@ -46,7 +46,7 @@ def test_the_same_solution_as_with_an_elimination_for_each(name, monkeypatch):
     cloud = make()
     posed = problem(cloud, robin=name == "graded")
     few = js.solve(posed, cloud, order=4, **options)
-    monkeypatch.setattr(operands, "_WORTH", 10**9)
+    monkeypatch.setattr(local_data, "_WORTH", 10**9)
     each = js.solve(posed, cloud, order=4, **options)
     told = [line for line in few.stats["skipped"] if line.startswith("recursion per particle, but for")]
     assert len(told) == 1 and not [line for line in each.stats["skipped"] if line.startswith("recursion")]

@@ -9,10 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jsmitsm import backends, choice, factorcache, linsolve, sparse
-from jsmitsm.errors import SolveError
-from jsmitsm.linsolve import SingularMatrix, factor, factorisations, solve
-from jsmitsm.ordering import nested_dissection
+from jsmitsm.linear import backends
+from jsmitsm.linear import solver_choice
+from jsmitsm.linear import factor_cache
+from jsmitsm.linear import linsolve
+from jsmitsm.linear import sparse
+from jsmitsm.runtime.errors import SolveError
+from jsmitsm.linear.linsolve import SingularMatrix, factor, factorisations, solve
+from jsmitsm.linear.ordering import nested_dissection
 
 BACKENDS = ["dense", "sparse", "iterative"]
 
@@ -287,14 +291,14 @@ def test_order_is_found_once_for_one_pattern(monkeypatch):
 
 
 def test_cache_is_bounded(monkeypatch):
-    monkeypatch.setattr(factorcache, "CACHE_ENTRIES", 2)
+    monkeypatch.setattr(factor_cache, "CACHE_ENTRIES", 2)
     index = np.arange(3)
     for k in range(1, 5):
         factor(np.full(3, float(k)), index, index, 3)
-    assert len(factorcache._kept) == 2
-    monkeypatch.setattr(factorcache, "CACHE_BYTES", 1)
+    assert len(factor_cache._kept) == 2
+    monkeypatch.setattr(factor_cache, "CACHE_BYTES", 1)
     f = factor(np.full(3, 9.0), index, index, 3)
-    assert factorcache._kept == [f]
+    assert factor_cache._kept == [f]
 
 
 # ------------------------------------------------------------------------------------------ order
@@ -438,19 +442,19 @@ def test_bad_input(change, message):
 
 def test_without_pyamg(monkeypatch):
     data, rows, cols, points = grid(20)
-    monkeypatch.setattr(choice, "installed", lambda _: False)
+    monkeypatch.setattr(solver_choice, "installed", lambda _: False)
     info = {}
     x = solve(data, rows, cols, np.ones(400), n=400, points=points, solver="iterative", info=info)
     assert info["backend"] == "ilu" and 0 < info["iterations"] < 100
     np.testing.assert_allclose(full(data, rows, cols, 400) @ x, 1.0, atol=1e-12)
-    monkeypatch.setattr(choice, "ITERATIVE_MIN", {2: 350})
-    assert choice.choose_backends(400, 2000, points, "auto", True)[0] == "nested dissection"
+    monkeypatch.setattr(solver_choice, "ITERATIVE_MIN", {2: 350})
+    assert solver_choice.choose_backends(400, 2000, points, "auto", True)[0] == "nested dissection"
 
 
 def test_auto_takes_multigrid_for_large_elliptic_problems_only(monkeypatch):
-    monkeypatch.setattr(choice, "ITERATIVE_MIN", {2: 350})
+    monkeypatch.setattr(solver_choice, "ITERATIVE_MIN", {2: 350})
     points = grid(20)[3]
-    first = lambda points, elliptic: choice.choose_backends(400, 2000, points, "auto", elliptic)[0]  # noqa: E731
+    first = lambda points, elliptic: solver_choice.choose_backends(400, 2000, points, "auto", elliptic)[0]  # noqa: E731
     assert first(points, True) == "amg" and first(points, False) == "nested dissection"
     bordered = np.where(np.arange(400)[:, None] == 399, np.nan, points)
     assert first(bordered, True) == "nested dissection"
@@ -458,8 +462,8 @@ def test_auto_takes_multigrid_for_large_elliptic_problems_only(monkeypatch):
 
 def test_pardiso_where_installed(monkeypatch):
     pytest.importorskip("pypardiso")
-    monkeypatch.setattr(choice, "PARDISO_MIN", {2: 350})
-    monkeypatch.setattr(choice, "cores", lambda: 2)
+    monkeypatch.setattr(solver_choice, "PARDISO_MIN", {2: 350})
+    monkeypatch.setattr(solver_choice, "cores", lambda: 2)
     data, rows, cols, points = grid(20)
     data = data * (1 + 0.1 * np.sin(np.arange(len(data))))  # not symmetric
     f = sparse.Factor(data, rows, cols, 400, points, "sparse")
@@ -550,12 +554,12 @@ def test_what_does_not_fit_in_memory_is_refused(monkeypatch):
     problem = js.Problem(lambda u, x: js.laplacian(u)(x), sides)
     js.solve(problem, cloud, solver="sparse")
     linsolve.clear_cache()
-    monkeypatch.setattr(choice, "_memory", lambda: 5e7)
-    monkeypatch.setattr(choice, "estimate_memory", lambda *_: 10**8)  # of the factors; the rows fit
+    monkeypatch.setattr(solver_choice, "_memory", lambda: 5e7)
+    monkeypatch.setattr(solver_choice, "estimate_memory", lambda *_: 10**8)  # of the factors; the rows fit
     with pytest.raises(js.SolveError, match=r'about 0\.1 GB for 529 unknowns.*solver="iterative"'):
         js.solve(problem, cloud, solver="sparse")
     assert js.solve(problem, cloud, solver="iterative").converged
-    monkeypatch.setattr(choice, "_memory", lambda: 1e5)
+    monkeypatch.setattr(solver_choice, "_memory", lambda: 1e5)
     with pytest.raises(js.SolveError, match="the rows and the matrix would need about .* fewer particles"):
         js.solve(problem, cloud, solver="iterative")
 
@@ -564,9 +568,9 @@ def test_memory_estimate():
     """Within a factor of two of the measured factor (8 bytes an entry and the row numbers)."""
     data, rows, cols, points = grid(60)
     entries = factor(data, rows, cols, 3600, points, "sparse").info["factor_entries"]
-    estimate = choice.estimate_memory(3600, 5 * 3600, 2)
+    estimate = solver_choice.estimate_memory(3600, 5 * 3600, 2)
     assert 6 * entries < estimate < 40 * entries
-    assert choice.estimate_memory(10**5, 2 * 10**6, 2) < choice.estimate_memory(10**5, 2 * 10**6, 3)
+    assert solver_choice.estimate_memory(10**5, 2 * 10**6, 2) < solver_choice.estimate_memory(10**5, 2 * 10**6, 3)
 
 
 def test_jit_does_not_hang_on_one_core():
@@ -576,7 +580,7 @@ def test_jit_does_not_hang_on_one_core():
     code = """
 import os; os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
 import jax, numpy as np, jax.numpy as jnp
-from jsmitsm.linsolve import solve
+from jsmitsm.linear.linsolve import solve
 n = 30000
 i = np.arange(n)
 run = jax.jit(jax.grad(lambda d: solve(d, i, i, jnp.sin(d), n=n, solver="sparse").sum()))
@@ -594,7 +598,7 @@ def test_matrices_that_differ_in_their_entries_alone_share_the_places():
     rows, cols, b = np.arange(5), np.arange(5), np.ones(5)
     several = [solve(np.full(5, scale), rows.copy(), cols.copy(), b, n=5, solver="sparse") for scale in (1.0, 2.0, 4.0)]
     solve(np.full(6, 1.0), np.arange(6), np.arange(6), np.ones(6), n=6, solver="sparse")
-    assert len({id(factorcache._known[f].pattern) for f in factorcache._kept}) == 2
+    assert len({id(factor_cache._known[f].pattern) for f in factor_cache._kept}) == 2
     before = factorisations()
     for scale, x in zip((1.0, 2.0, 4.0), several):
         assert np.array_equal(solve(np.full(5, scale), rows, cols, b, n=5, solver="sparse"), x)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jsmitsm as js
-from jsmitsm import neighbours as room
+from jsmitsm.cloud import neighbours as room
 
 CLOUDS = [mm.jittered(1, 12), mm.jittered(2, 7), mm.jittered(3, 4)]
 

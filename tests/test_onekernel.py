@@ -10,15 +10,16 @@ import numpy as np
 import pytest
 
 import jsmitsm as js
-from jsmitsm import eager, onekernel
+from jsmitsm.runtime import whole_program
+from jsmitsm.runtime import one_kernel
 
-needs_one_kernel = pytest.mark.skipif(not onekernel.available(), reason="this JAX makes no single kernels")
+needs_one_kernel = pytest.mark.skipif(not one_kernel.available(), reason="this JAX makes no single kernels")
 X = np.array([0.3, -0.4, 1.2])
 
 
 def run(function, **arguments):
     leaves, tree = jax.tree.flatten(arguments)
-    program = eager._whole(function, (), tree, (), True)
+    program = whole_program._whole(function, (), tree, (), True)
     return program, program.run(*leaves)
 
 
@@ -63,13 +64,13 @@ def test_an_operation_that_no_kernel_holds_takes_many():
 def test_the_local_phase_is_one_kernel(method, side, monkeypatch):
     made = []
 
-    class Kept(eager.Program):
+    class Kept(whole_program.Program):
         def __init__(self, *arguments, **named):
             super().__init__(*arguments, **named)
             made.append(self)
 
-    monkeypatch.setattr(eager, "Program", Kept)
-    eager._whole.cache_clear()
+    monkeypatch.setattr(whole_program, "Program", Kept)
+    whole_program._whole.cache_clear()
     cloud = js.rectangle((0, 0), (1, 1), (side, side), jitter=0.2)
     js.solve(js.Problem(lambda u, x: (1 + x[0]) * js.laplacian(u)(x) - x[1], held(cloud, 0.0)), cloud, method=method, order=2)
     assert any("rows" in p.name for p in made) and all(p.small for p in made if not p.on_host)
@@ -89,6 +90,6 @@ def test_one_kernel_gives_the_numbers_of_many(method, dim, monkeypatch):
         held(cloud, exact),
     )
     one = js.solve(posed, cloud, method=method, order=2 if method != "S" else 4).u
-    monkeypatch.setattr(onekernel, "_TRIED", ())
+    monkeypatch.setattr(one_kernel, "_TRIED", ())
     many = js.solve(posed, cloud, method=method, order=2 if method != "S" else 4).u
     np.testing.assert_allclose(one, many, rtol=1e-9, atol=1e-11)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jsmitsm as js
-from jsmitsm.periodic import with_corners
+from jsmitsm.discretization.periodic import with_corners
 
 wave = lambda x: jnp.sin(2 * jnp.pi * x[0]) * jnp.exp(x[-1])
 slope = js.condition(lambda u, x, n: n @ (js.grad(u)(x) - js.grad(wave)(x)))

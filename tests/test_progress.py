@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 
 import jsmitsm as js
-from jsmitsm import backends, pieces, progress
+from jsmitsm.linear import backends
+from jsmitsm.discretization import sharing
+from jsmitsm.runtime import progress
 
 pytest.importorskip("tqdm")
 ENDS = {"left": js.dirichlet(0.0), "right": js.dirichlet(0.0)}
@@ -30,7 +32,7 @@ def watch(monkeypatch):
     monkeypatch.delenv("TQDM_DISABLE", raising=False)
     monkeypatch.setattr(progress, "DELAY", 0.0)
     monkeypatch.setattr(progress, "PAUSE", 0.0)
-    monkeypatch.setattr(pieces, "PIECE", 4)
+    monkeypatch.setattr(sharing, "PIECE", 4)
     monkeypatch.setattr(sys, "stderr", Terminal())
     return sys.stderr.getvalue
 
@@ -108,7 +110,7 @@ def test_a_notebook_shows_bars_and_still_has_its_numbers(monkeypatch):
     code = """
 import sys
 import jsmitsm as js
-from jsmitsm import progress
+from jsmitsm.runtime import progress
 seen, write = [], sys.stderr.write
 sys.stderr.write = lambda text: (seen.append(text), write(text))[1]
 progress.DELAY = progress.PAUSE = 0.0

@@ -18,7 +18,8 @@ import pytest
 
 import jsmitsm as js
 from benchmarks.problems import CASES
-from jsmitsm import assembly
+from jsmitsm.particle import batches
+from jsmitsm.runtime.size_classes import padded_size
 
 NAMES = """
     Cloud interval rectangle box from_sdf from_polygon
@@ -55,51 +56,6 @@ def test_the_signature_of_solve():
 
 
 # ------------------------------------------------------------------ importing
-
-
-def imports():
-    """Module -> the package's modules it imports at import time (not inside functions)."""
-    found = {}
-    for path in PACKAGE.glob("*.py"):
-        if path.stem == "__init__":
-            continue
-        names = set()
-        for node in ast.parse(path.read_text()).body:
-            if isinstance(node, ast.ImportFrom) and node.module:
-                if node.module == "jsmitsm":
-                    names |= {alias.name for alias in node.names}
-                elif node.module.startswith("jsmitsm."):
-                    names.add(node.module.split(".")[1])
-        found[path.stem] = names & {p.stem for p in PACKAGE.glob("*.py")}
-    return found
-
-
-def test_imports_run_one_way():
-    """The graph of the modules' imports has an order: peel off what imports nothing that is left."""
-    left = imports()
-    while left:
-        leaves = [name for name, uses in left.items() if not uses & set(left)]
-        assert leaves, f"a ring of imports among {sorted(left)}"
-        left = {name: uses for name, uses in left.items() if name not in leaves}
-
-
-def test_rooms_stand_in_their_order():
-    """Geometry, calculus, weights, the joint, the result: no room knows a later one."""
-    order = ("taylor", "operators", "trace", "clouds", "kernels", "neighbours", "problem", "recursion", "moments",
-             "assembly", "solution", "solve")  # fmt: skip
-    graph = imports()
-
-    def reached(name):
-        todo, seen = [name], set()
-        while todo:
-            for other in graph[todo.pop()] - seen:
-                seen.add(other)
-                todo.append(other)
-        return seen
-
-    for k, name in enumerate(order):
-        later = reached(name) & set(order[k + 1 :])
-        assert not later, f"{name} knows {later}"
 
 
 def in_a_fresh_process(code, **environment):
@@ -283,10 +239,10 @@ AGAIN = {
 def test_a_second_solve_compiles_nothing(again, compiled):
     js.solve(wave(1.0), CLOUD)
     problem, cloud = AGAIN[again]()
-    before, traces = compiled.count, dict(assembly.TRACES)
+    before, traces = compiled.count, dict(batches.TRACES)
     sol = js.solve(problem, cloud)
     assert sol.converged
-    assert assembly.TRACES == traces
+    assert batches.TRACES == traces
     assert compiled.count == before
 
 
@@ -296,10 +252,10 @@ def test_new_params_compile_nothing(compiled):
         {"left": js.dirichlet(0.0), "right": js.dirichlet(1.0)}, params={"k": 1.0, "s": 2.0},
     )  # fmt: skip
     first = js.solve(problem, CLOUD)
-    before, traces = compiled.count, dict(assembly.TRACES)
+    before, traces = compiled.count, dict(batches.TRACES)
     second = js.solve(problem.replace(params={"k": 3.0, "s": -1.0}), CLOUD)
     assert np.abs(np.asarray(first.u) - np.asarray(second.u)).max() > 0.1
-    assert assembly.TRACES == traces and compiled.count == before
+    assert batches.TRACES == traces and compiled.count == before
 
 
 def total(cloud, near):
@@ -330,28 +286,28 @@ def graded():
 @pytest.mark.parametrize("cloud", [CLOUD, stirred(CLOUD, 3)], ids=["other numbers", "other particles"])
 def test_a_second_eager_gradient_compiles_nothing(graded, compiled, cloud):
     near, first = graded
-    before, traces = compiled.count, dict(assembly.TRACES)
+    before, traces = compiled.count, dict(batches.TRACES)
     second = jax.grad(total(cloud, near))(given(cloud, 1.01))
-    assert assembly.TRACES == traces and compiled.count == before
+    assert batches.TRACES == traces and compiled.count == before
     assert abs(first["k"] - second["k"]) > 1e-6, "the same numbers: nothing was tested"
 
 
 def test_a_gradient_on_a_cloud_of_similar_size_reuses_the_local_phase(graded):
     """Its derivative too: what is compiled is small, for the exact shapes of the global system."""
     cloud = mm.jittered(1, len(CLOUD) + 1, seed=5)
-    assert assembly.padded_size(len(cloud)) == assembly.padded_size(len(CLOUD))
+    assert padded_size(len(cloud)) == padded_size(len(CLOUD))
     names = []
     logger = logging.getLogger("jax._src.interpreters.pxla")
     handler = logging.Handler()
     handler.emit = lambda record: names.append(record.getMessage())
     logger.addHandler(handler)
-    traces = dict(assembly.TRACES)
+    traces = dict(batches.TRACES)
     try:
         with jax.log_compiles():
             jax.grad(total(cloud, js.stencils(cloud, size=9)))(given(cloud))
     finally:
         logger.removeHandler(handler)
-    assert assembly.TRACES == traces
+    assert batches.TRACES == traces
     assert any("Compiling jit(pulled_moved__entries)" in name for name in names), "nothing was listened to"
     assert not [name for name in names if "rows)" in name]
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import jsmitsm as js
-from jsmitsm.recall import Unknown, identity
-from jsmitsm.trace import trace
+from jsmitsm.equation.recording import Unknown, identity
+from jsmitsm.equation.tracing import trace
 
 FACTOR = 2.0
 

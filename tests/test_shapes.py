@@ -9,9 +9,9 @@ import pytest
 from scipy.spatial import cKDTree
 
 import jsmitsm as js
-from jsmitsm import clouds, sdf
-from jsmitsm.evenness import quality
-from jsmitsm.shapes import from_polygon, from_sdf
+from jsmitsm import sdf
+from jsmitsm.cloud.quality import quality
+from jsmitsm.cloud.shapes import from_polygon, from_sdf
 
 SQUARE = np.array([(0, 0), (1, 0), (1, 1), (0, 1)], float)
 L_SHAPE = np.array([(0, 0), (2, 0), (2, 1), (1, 1), (1, 2), (0, 2)], float)
@@ -274,14 +274,14 @@ def test_groups_first_match_wins():
 
 def test_quality_of_lattices():
     """Squares: the empty ball has radius 1/sqrt 2 of the spacing. Also without normals, in 1D and 3D."""
-    square = clouds.rectangle((0, 0), (1, 2), (11, 21))
-    for cloud in (square, clouds.Cloud(square.points, square.groups)):
+    square = js.rectangle((0, 0), (1, 2), (11, 21))
+    for cloud in (square, js.Cloud(square.points, square.groups)):
         measured = quality(cloud)
         np.testing.assert_allclose(measured.mesh_ratio, np.sqrt(2), rtol=1e-9)
         np.testing.assert_allclose(measured.fill_distance, 0.1 / np.sqrt(2), rtol=1e-9)
         np.testing.assert_allclose(measured.separation_distance, 0.1, rtol=1e-9)
-    np.testing.assert_allclose(quality(clouds.box((0,) * 3, (1,) * 3, (5,) * 3)).mesh_ratio, np.sqrt(3), rtol=1e-6)
-    np.testing.assert_allclose(quality(clouds.interval(0, 1, 11)).mesh_ratio, 1.0, rtol=1e-9)
+    np.testing.assert_allclose(quality(js.box((0,) * 3, (1,) * 3, (5,) * 3)).mesh_ratio, np.sqrt(3), rtol=1e-6)
+    np.testing.assert_allclose(quality(js.interval(0, 1, 11)).mesh_ratio, 1.0, rtol=1e-9)
 
 
 def test_quality_sees_a_hole_and_a_pair():
@@ -289,9 +289,9 @@ def test_quality_sees_a_hole_and_a_pair():
     x, n, inner = cloud.points, len(cloud), len(cloud.groups["interior"])
     kept = np.linalg.norm(x, axis=1) > 0.25
     inner = kept[:inner].sum()  # interior particles come first
-    holed = clouds.Cloud(x[kept], {"interior": np.arange(inner), "boundary": np.arange(inner, kept.sum())})
+    holed = js.Cloud(x[kept], {"interior": np.arange(inner), "boundary": np.arange(inner, kept.sum())})
     assert quality(holed, 0.1).fill_distance > 0.24
-    crowded = clouds.Cloud(
+    crowded = js.Cloud(
         np.concatenate([x, x[:1] + 0.001]),
         {"interior": np.append(cloud.groups["interior"], n), "boundary": cloud.boundary},
     )
@@ -359,7 +359,7 @@ def disk(**options):
         (lambda: from_polygon(SQUARE[[0, 1, 1, 2]], 0.1), "vertices: vertex 1"),
         (lambda: from_polygon(SQUARE[:2], 0.1), "at least 3"),
         (lambda: from_polygon(SQUARE + np.nan, 0.1), "not finite"),
-        (lambda: quality(clouds.interval(0, 1, 2)), "cloud: 2 particles"),
+        (lambda: quality(js.interval(0, 1, 2)), "cloud: 2 particles"),
     ],
 )
 def test_bad_input(build, message):

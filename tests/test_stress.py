@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 import jsmitsm as js
+from jsmitsm.linear import solver_choice
+from jsmitsm.solution import run
 from benchmarks import stability as st
 
 # What an order 4 keeps on these clouds: about ten times what was measured.
@@ -125,8 +127,8 @@ def test_random_particles_on_a_line(seed):
 def test_a_problem_that_will_not_fit_is_refused_before_its_rows_are_made(monkeypatch, solver, memory, words):
     task, cloud = st.problem("poisson", 2, HOME), st.lattice(2, 0.2, shape=(45, 45))
     made = []
-    monkeypatch.setattr(js.choice, "_memory", lambda: memory)
-    monkeypatch.setattr(js.discretize, "all_rows", lambda *a: made.append(a))
+    monkeypatch.setattr(solver_choice, "_memory", lambda: memory)
+    monkeypatch.setattr(run, "all_rows", lambda *a: made.append(a))
     with pytest.raises(js.SolveError, match=f"(?s){words}.*GB.*fewer particles"):
         js.solve(task, cloud, solver=solver)
     assert not made
@@ -136,7 +138,7 @@ def test_a_problem_that_will_not_fit_is_refused_before_its_rows_are_made(monkeyp
 def test_wider_rows_need_more_memory(monkeypatch, options):
     """20 MB are enough for the rows of method S on these particles, not for blocks or neighbours of neighbours."""
     task, cloud = st.problem("poisson", 2, HOME), st.lattice(2, 0.2, shape=(45, 45))
-    monkeypatch.setattr(js.choice, "_memory", lambda: 2e7)
+    monkeypatch.setattr(solver_choice, "_memory", lambda: 2e7)
     assert js.solve(task, cloud, solver="sparse").converged
     with pytest.raises(js.SolveError, match="(?s)rows and the matrix.*GB.*fewer particles"):
         js.solve(task, cloud, solver="sparse", **options)

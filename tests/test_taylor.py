@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jsmitsm.jets import evaluate, taylor_coefficients
-from jsmitsm.series import Ring, add, div, mul, variable
-from jsmitsm.taylor import count, degree_of_count, factorial, index_of, multi_indices
+from jsmitsm.taylor.jets import evaluate, taylor_coefficients
+from jsmitsm.taylor.series import Ring, add, div, mul, variable
+from jsmitsm.taylor.multi_indices import count, degree_of_count, factorial, index_of, multi_indices
 
 
 @pytest.mark.parametrize("dim", [1, 2, 3])

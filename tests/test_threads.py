@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 import jsmitsm as js
-from jsmitsm import assembly, pieces, threads
+from jsmitsm.particle import batches
+from jsmitsm.discretization import sharing
+from jsmitsm.runtime import threads
 
 SIDES = dict.fromkeys(("left", "right", "bottom", "top"), js.dirichlet(0.0))
 PROBLEM = js.Problem(lambda u, x: (1.0 + x[0]) * js.laplacian(u)(x) + 1.0, SIDES)  # no two particles alike
@@ -16,8 +18,8 @@ PROBLEM = js.Problem(lambda u, x: (1.0 + x[0]) * js.laplacian(u)(x) + 1.0, SIDES
 
 @pytest.fixture
 def two_cores(monkeypatch):
-    monkeypatch.setattr(pieces, "PIECE", 64)
-    for module in (pieces, threads):
+    monkeypatch.setattr(sharing, "PIECE", 64)
+    for module in (sharing, threads):
         monkeypatch.setattr(module, "cores", lambda: 2)
 
 
@@ -26,11 +28,11 @@ def solved(seed):
 
 
 def test_pieces_make_the_whole_and_compile_once(two_cores, monkeypatch):
-    before = assembly.TRACES["rows"]
+    before = batches.TRACES["rows"]
     shared = solved(1)
-    assert assembly.TRACES["rows"] == before + 1
+    assert batches.TRACES["rows"] == before + 1
     assert len(set(np.round(shared.u, 12))) > 300
-    monkeypatch.setattr(pieces, "cores", lambda: 1)
+    monkeypatch.setattr(sharing, "cores", lambda: 1)
     alone = solved(1)
     np.testing.assert_allclose(shared.u, alone.u, rtol=1e-11)
     np.testing.assert_allclose(shared.coefficients, alone.coefficients, rtol=1e-12, atol=1e-9)
@@ -87,7 +89,7 @@ def test_flags_do_not_depend_on_how_the_cloud_was_cut(two_cores, monkeypatch):
     cloud = js.rectangle((0, 0), (1, 1), (21, 21))
     problem = js.Problem(lambda u, x: js.laplacian(u)(x) - jax.numpy.sin(8 * x[0]), SIDES)
     sol = js.solve(problem, cloud, method="I", order=2, kernel=js.Gaussian(2.2 * cloud.spacing, 2.0))
-    monkeypatch.setattr(pieces, "cores", lambda: 1)
+    monkeypatch.setattr(sharing, "cores", lambda: 1)
     assert isinstance(sol.flags, list)
 
 
@@ -95,9 +97,9 @@ def test_methods_of_two_stages_share_programs_too():
     problem = js.Problem(lambda u, x: js.laplacian(u)(x) - 1.0, {"left": js.dirichlet(0.0), "right": js.dirichlet(0.0)})
     counts = []
     for n in (150, 151, 153):
-        before = assembly.TRACES["rows"]
+        before = batches.TRACES["rows"]
         js.solve(problem, js.interval(0.0, 1.0, n), method="II", order=4, kernel=js.Gaussian(2.2 / (n - 1), 2.0))
-        counts.append(assembly.TRACES["rows"] - before)
+        counts.append(batches.TRACES["rows"] - before)
     assert counts[0] >= 2 and counts[1:] == [0, 0]
 
 

@@ -5,10 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import jsmitsm.trace as trace_module
-from jsmitsm.operators import divergence, grad, hessian, laplacian, local_field, partial
-from jsmitsm.taylor import count, multi_indices
-from jsmitsm.trace import trace
+import jsmitsm.equation.tracing as trace_module
+from jsmitsm.equation.field import local_field
+from jsmitsm.equation.operators import divergence, grad, hessian, laplacian, partial
+from jsmitsm.taylor.multi_indices import count, multi_indices
+from jsmitsm.equation.tracing import trace
 
 NU = 0.25
 
@@ -159,7 +160,7 @@ def test_nonlinear_linearisation():
     """Of u u_x - u_yy at u = sin(x) y: coefficients u_x, u, -1, residual u u_x."""
     points = np.random.default_rng(1).uniform(size=(4, 2))
     got = trace(lambda u, x: u(x) * partial(u, (1, 0))(x) - partial(u, (0, 2))(x), 2)
-    from jsmitsm.jets import taylor_coefficients
+    from jsmitsm.taylor.jets import taylor_coefficients
 
     def series(f):
         return taylor_coefficients(f, points, 3)

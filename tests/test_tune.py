@@ -3,7 +3,6 @@
 All on one line of 15 particles, so that compiled programs are shared.
 """
 
-from importlib import import_module
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,11 +10,11 @@ import optax
 import pytest
 
 import jsmitsm as js
-from jsmitsm import assembly
+from jsmitsm.particle import batches
 
-room = import_module("jsmitsm.tuning")  # js.tune is the function
-from jsmitsm import objective as score_room
-from jsmitsm.objective import Objective, hand_kernel, reference
+from jsmitsm.tuning import tune as room
+from jsmitsm.tuning import objective as score_room
+from jsmitsm.tuning.objective import Objective, hand_kernel, reference
 
 N = 15
 
@@ -90,9 +89,9 @@ def test_the_result_says_itself_in_one_line(result):
 
 def test_steps_compile_nothing(result):
     """More steps make no program; another kernel's own support, in the returned solution, may."""
-    before = assembly.TRACES["rows"]
+    before = batches.TRACES["rows"]
     assert len(tuned(steps=6).history["h"]) > 5
-    assert assembly.TRACES["rows"] <= before + 1
+    assert batches.TRACES["rows"] <= before + 1
 
 
 def test_its_name_in_the_package_is_the_function():

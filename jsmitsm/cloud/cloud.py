@@ -1,0 +1,344 @@
+"""Particles, their groups and normals, and clouds on lattices."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from jsmitsm.runtime.errors import some
+from jsmitsm.runtime.tracers import frozen, owned
+
+INTERIOR = "interior"
+# Coordinates beyond this, or all below its inverse, have powers that are no numbers.
+FAR = 1e100
+_SIDES = (("left", 0, 0), ("right", 0, 1), ("bottom", 1, 0), ("top", 1, 1), ("front", 2, 0), ("back", 2, 1))
+
+
+class Groups(Mapping[str, np.ndarray]):
+    """Named, disjoint sets of particles; immutable and hashable, so it can be static under jit."""
+
+    def __init__(self, groups: Mapping[str, np.ndarray]):
+        self._groups: dict[str, np.ndarray] = {}
+        for name, index in groups.items():
+            index = np.array(index, dtype=np.int64)
+            index.setflags(write=False)
+            self._groups[name] = index
+        self._key = tuple((name, index.tobytes()) for name, index in self._groups.items())
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        return self._groups[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._groups)
+
+    def __len__(self) -> int:
+        return len(self._groups)
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Groups) and self._key == other._key
+
+    def __repr__(self) -> str:
+        return "{" + ", ".join(f"{name}: {len(index)}" for name, index in self.items()) + "}"
+
+
+@jax.tree_util.register_pytree_node_class
+class Cloud:
+    """A cloud of particles with named groups.
+
+    Parameters
+    ----------
+    points : (N, D) float array, D = 1, 2 or 3 (also in 1D), in length units.
+    groups : maps a name to an integer index array. The groups are disjoint and cover every
+        particle; ``"interior"`` is one of them, every other one is a boundary group.
+    normals : (N, D) unit outward normals, NaN in the interior. Needed only where a boundary
+        condition uses them.
+
+    Raises
+    ------
+    ValueError
+        For a wrong shape, NaN, overlapping or incomplete groups, duplicate particles.
+
+    A cloud is a pytree: points and normals are leaves, groups are static. It does not change: its arrays are
+    read-only copies, and :meth:`replace` makes another one.
+
+    Examples
+    --------
+    >>> import numpy as np, jsmitsm as js
+    >>> cloud = js.Cloud(np.array([[0.0], [0.5], [1.0]]), {"interior": [1], "ends": [0, 2]})
+    >>> len(cloud), cloud.spacing
+    (3, 0.5)
+    """
+
+    def __init__(self, points: Any, groups: Mapping[str, Any], normals: Any = None):
+        self.points = _checked_points(points)
+        self.groups = _checked_groups(groups, len(self.points))
+        self.normals = _checked_normals(normals, self.points, self.groups)
+        self._spacing: float | None = None
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        # What was solved on a cloud rests on it.
+        if name in ("points", "groups", "normals") and name in self.__dict__:
+            raise AttributeError(f"{name}: a Cloud does not change; make another, cloud.replace({name}=...) or js.Cloud")
+        object.__setattr__(self, name, value)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update({name: frozen(value) for name, value in state.items()})
+
+    @property
+    def dim(self) -> int:
+        """Number of space dimensions D."""
+        return self.points.shape[1]
+
+    @property
+    def spacing(self) -> float:
+        """The smallest distance between two particles, found on the host."""
+        if self._spacing is None:
+            if isinstance(self.points, jax.core.Tracer):
+                raise ValueError(
+                    "cloud.spacing: the points are traced by a JAX transform, and the smallest distance "
+                    "is found on the host; take cloud.spacing before the transform and pass the number in"
+                )
+            from scipy.spatial import cKDTree
+
+            points = np.asarray(self.points)
+            if len(points) < 2:
+                raise ValueError("cloud.spacing: a distance needs at least two particles, the cloud has 1; add some")
+            self._spacing = float(cKDTree(points).query(points, k=2)[0][:, 1].min())
+        return self._spacing
+
+    @property
+    def boundary(self) -> np.ndarray:
+        """Indices of all particles that are not in the interior, ascending."""
+        return np.setdiff1d(np.arange(len(self)), self.groups[INTERIOR])
+
+    def replace(self, points: Any = None, normals: Any = None) -> Cloud:
+        """The same groups with other points or normals (traced values welcome)."""
+        new = object.__new__(Cloud)
+        if points is not None and np.shape(points) != self.points.shape:
+            raise ValueError(
+                f"points: shape {np.shape(points)} came, {self.points.shape} was expected; "
+                "build a new Cloud for another number of particles"
+            )
+        new.points = self.points if points is None else _checked_points(points)
+        new.groups = self.groups
+        new.normals = self.normals if normals is None else _checked_normals(normals, new.points, self.groups)
+        new._spacing = None if points is not None else self._spacing
+        return new
+
+    def __len__(self) -> int:
+        return self.points.shape[0]
+
+    def __repr__(self) -> str:
+        return f"Cloud({len(self)} particles in {self.dim}D, groups {self.groups!r})"
+
+    def tree_flatten(self):
+        return (self.points, self.normals), self.groups
+
+    @classmethod
+    def tree_unflatten(cls, groups, leaves):
+        new = object.__new__(cls)
+        new.points, new.normals = map(owned, leaves)
+        new.groups = groups
+        new._spacing = None
+        return new
+
+
+def _checked_points(points: Any) -> Any:
+    """Points as a float array (N, D); a traced array passes through."""
+    if isinstance(points, jax.core.Tracer):
+        shape = points.shape
+    else:
+        try:
+            array = np.asarray(points)
+            if array.dtype.kind not in "fiu":
+                raise TypeError
+        except (TypeError, ValueError):
+            raise ValueError(
+                f"points: expected a real array of shape (N, D), got {type(points).__name__} "
+                "that is not one; pass e.g. np.array([[0.0, 0.0], [1.0, 0.0]])"
+            ) from None
+        points = array.astype(np.float32 if array.dtype == np.float32 else np.float64)  # a copy: the user's may change
+        shape = points.shape
+    if len(shape) != 2 or shape[1] not in (1, 2, 3) or shape[0] == 0:
+        hint = "; in 1D use points[:, None]" if len(shape) == 1 else ""
+        raise ValueError(f"points: expected shape (N, D) with D = 1, 2 or 3, got {shape}{hint}")
+    if isinstance(points, np.ndarray):
+        bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
+        if len(bad):
+            raise ValueError(f"points: NaN or infinite coordinates at particles {some(bad, most=8)}; remove them")
+        size = float(abs(points).max())
+        if size > FAR or 0.0 < size < 1.0 / FAR:
+            raise ValueError(
+                f"points: coordinates of size {size:.0e}, whose powers leave the range of floats; use another unit of "
+                "length"
+            )
+        order = np.lexsort(points.T)
+        same = np.flatnonzero((np.diff(points[order], axis=0) == 0).all(axis=1))
+        if len(same):
+            pairs = [(int(order[k]), int(order[k + 1])) for k in same[:5]]
+            raise ValueError(
+                f"points: {len(same)} duplicate particles, pairs {pairs}; keep one of each (np.unique(points, axis=0))"
+            )
+    return frozen(points)
+
+
+def _checked_groups(groups: Mapping[str, Any], n: int) -> Groups:
+    """Disjoint groups that cover all n particles."""
+    if not isinstance(groups, Mapping) or INTERIOR not in groups:
+        raise ValueError(
+            f'groups: expected a dict of index arrays with a key "interior", got {_describe_groups(groups)}'
+        )
+    owner = np.full(n, -1)
+    checked = {}
+    for k, (name, index) in enumerate(groups.items()):
+        if not isinstance(name, str):
+            raise ValueError(f"groups: the name {name!r} of a group is no string; write e.g. {str(name)!r}")
+        try:
+            index = np.asarray(index)
+            if index.size == 0:
+                index = index.astype(np.int64).reshape(-1)
+            if index.ndim != 1 or index.dtype.kind not in "iu":
+                raise ValueError
+        except ValueError:
+            came = f"{index.dtype} of shape {index.shape}" if isinstance(index, np.ndarray) else f"{index!r}"
+            raise ValueError(
+                f"groups[{name!r}]: expected a 1D integer index array, got {came}; "
+                "turn a mask into indices with np.flatnonzero"
+            ) from None
+        if index.size and (index.min() < 0 or index.max() >= n):
+            raise ValueError(
+                f"groups[{name!r}]: indices from {index.min()} to {index.max()}, expected 0 to {n - 1} "
+                f"for {n} particles"
+            )
+        once, count = np.unique(index, return_counts=True)
+        taken = once[(owner[once] >= 0) | (count > 1)]
+        if len(taken):
+            raise ValueError(
+                f"groups[{name!r}]: particles {some(taken, most=8)} are in two groups or twice "
+                "in one; every particle belongs to exactly one group"
+            )
+        owner[index] = k
+        checked[name] = index
+    missing = np.flatnonzero(owner < 0)
+    if len(missing):
+        raise ValueError(
+            f"groups: particles {some(missing, most=8)} belong to no group; add them to one, e.g. 'interior'"
+        )
+    return Groups(checked)
+
+
+def _checked_normals(normals: Any, points: Any, groups: Groups) -> Any:
+    """Unit normals at the boundary, NaN inside; None and traced arrays pass through."""
+    if normals is None:
+        return None
+    if np.shape(normals) != points.shape:
+        raise ValueError(f"normals: expected shape {points.shape} like points, got {np.shape(normals)}")
+    if isinstance(normals, jax.core.Tracer):
+        return normals
+    try:
+        normals = np.asarray(normals)
+        if normals.dtype.kind == "c":
+            raise TypeError
+        normals = normals.astype(np.float64)
+    except (TypeError, ValueError):
+        raise ValueError("normals: expected real numbers, unit vectors that point outward") from None
+    normals[groups[INTERIOR]] = np.nan
+    length = np.linalg.norm(normals, axis=1)
+    bad = np.flatnonzero(np.abs(length - 1) > 1e-6)
+    if len(bad):
+        raise ValueError(
+            f"normals: not of unit length at particles {some(bad, most=8)} (length {length[bad[0]]:.3g}); "
+            "divide by np.linalg.norm(normals, axis=1, keepdims=True)"
+        )
+    return frozen(normals)
+
+
+def _describe_groups(groups: Any) -> str:
+    return f"keys {list(groups)}" if isinstance(groups, Mapping) else type(groups).__name__
+
+
+def interval(a: float, b: float, n: int) -> Cloud:
+    """``n`` equally spaced particles on [a, b], ascending; groups interior, left, right.
+
+    Raises ValueError unless b > a and n is at least 2.
+
+    >>> import jsmitsm as js
+    >>> js.interval(0.0, 1.0, 5).spacing
+    0.25
+    """
+    return _lattice((a,), (b,), (n,), 0.0, 0, names=("a", "b", "n"))
+
+
+def rectangle(
+    lo: Sequence[float], hi: Sequence[float], shape: Sequence[int], jitter: float = 0.0, seed: int = 0
+) -> Cloud:
+    """A lattice of ``shape = (nx, ny)`` particles on the rectangle from ``lo`` to ``hi``.
+
+    Groups: interior, left, right, bottom, top; a corner belongs to the first that claims it, in
+    that order. ``jitter`` moves interior particles by up to that fraction of the spacing along
+    each axis, reproducibly by ``seed``. Raises ValueError for an empty rectangle, fewer than two
+    particles along an axis, or a jitter of half a spacing or more.
+
+    >>> import jsmitsm as js
+    >>> len(js.rectangle((0, 0), (4, 9), (5, 10)))
+    50
+    """
+    return _lattice(lo, hi, shape, jitter, seed, dim=2)
+
+
+def box(lo: Sequence[float], hi: Sequence[float], shape: Sequence[int], jitter: float = 0.0, seed: int = 0) -> Cloud:
+    """A lattice of ``shape = (nx, ny, nz)`` particles on the box from ``lo`` to ``hi``; ``jitter``,
+    ``seed`` and errors as for :func:`rectangle`, with the groups front (low z) and back (high z) besides.
+
+    >>> import jsmitsm as js
+    >>> sorted(js.box((0, 0, 0), (1, 1, 1), (3, 3, 3)).groups)
+    ['back', 'bottom', 'front', 'interior', 'left', 'right', 'top']
+    """
+    return _lattice(lo, hi, shape, jitter, seed, dim=3)
+
+
+def _lattice(lo, hi, shape, jitter, seed, dim=1, names=("lo", "hi", "shape")) -> Cloud:
+    """A lattice cloud of any dimension."""
+    lo, hi = (_checked_corner(v, name, dim) for v, name in zip((lo, hi), names))
+    if not (hi > lo).all():
+        raise ValueError(f"{names[1]}: {hi.tolist()} must be greater than {names[0]} = {lo.tolist()} along every axis")
+    counts = np.atleast_1d(np.asarray(shape))
+    if counts.shape != (dim,) or counts.dtype.kind not in "iu" or (counts < 2).any():
+        raise ValueError(f"{names[2]}: expected {dim} whole number(s) of at least 2, got {shape!r}")
+    if not isinstance(jitter, (int, float, np.number)) or not 0.0 <= jitter < 0.5:
+        raise ValueError(f"jitter: expected 0 <= jitter < 0.5 spacings (beyond, particles may meet), got {jitter!r}")
+    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
+        raise ValueError(f"seed: expected a whole number from 0, the start of the random numbers, got {seed!r}")
+    axes = [np.linspace(a, b, n) for a, b, n in zip(lo, hi, counts)]
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, dim)
+    place = np.stack(np.meshgrid(*[np.arange(n) for n in counts], indexing="ij"), axis=-1).reshape(-1, dim)
+    free = np.ones(len(points), bool)
+    normals = np.full(points.shape, np.nan)
+    sides: dict[str, np.ndarray] = {}
+    for name, axis, end in _SIDES[: 2 * dim]:
+        claimed = free & (place[:, axis] == (counts[axis] - 1 if end else 0))
+        sides[name] = np.flatnonzero(claimed)
+        normals[claimed] = 0.0
+        normals[claimed, axis] = 1.0 if end else -1.0
+        free &= ~claimed
+    inside = np.flatnonzero(free)
+    if jitter:
+        spacing = (hi - lo) / (counts - 1)
+        points[inside] += jitter * spacing * np.random.default_rng(seed).uniform(-1, 1, (len(inside), dim))
+    return Cloud(points, {INTERIOR: inside, **sides}, normals)
+
+
+def _checked_corner(value: Any, name: str, dim: int) -> np.ndarray:
+    try:
+        corner = np.atleast_1d(np.asarray(value, dtype=np.float64))
+    except (TypeError, ValueError):
+        raise ValueError(f"{name}: expected {dim} finite number(s), got {value!r}") from None
+    if corner.shape != (dim,) or not np.isfinite(corner).all():
+        raise ValueError(f"{name}: expected {dim} finite number(s), got {value!r}")
+    return corner

@@ -1,0 +1,197 @@
+"""Polygons with holes: their checks, boundary particles and signed distance, all on the host."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from jsmitsm.cloud import filling, levelset
+from jsmitsm.cloud.filling import Spacing
+
+_SHARP = np.deg2rad(20.0)  # a vertex that turns by more is a corner of the shape, not a sample of a curve
+
+
+def checked_holes(holes: Any) -> list[Any]:
+    if isinstance(holes, (str, Mapping)) or not hasattr(holes, "__iter__"):
+        raise ValueError(f"holes: expected a sequence of polygons (V, 2), got {holes!r}")
+    holes = list(holes)
+    if any(np.ndim(hole) == 1 for hole in holes):
+        raise ValueError("holes: expected a sequence of polygons (V, 2), got one polygon; pass holes=[vertices]")
+    return holes
+
+
+def checked_loop(name: str, vertices: Any) -> np.ndarray:
+    """Vertices (V, 2) of a polygon, counter-clockwise, not closed."""
+    try:
+        loop = np.asarray(vertices, dtype=np.float64)
+    except (TypeError, ValueError):
+        loop = np.zeros(0)
+    if loop.ndim != 2 or loop.shape[1] != 2:
+        raise ValueError(f"{name}: expected an array of shape (V, 2), got {np.shape(loop)}")
+    if not np.isfinite(loop).all():
+        raise ValueError(f"{name}: not finite at vertex {np.flatnonzero(~np.isfinite(loop).all(axis=1))[0]}")
+    if len(loop) > 1 and (loop[0] == loop[-1]).all():
+        loop = loop[:-1]  # many programs repeat the first vertex to close the polygon
+    if len(loop) < 3:
+        raise ValueError(f"{name}: {len(loop)} different vertices, at least 3 are needed for a polygon")
+    same = np.flatnonzero((loop == np.roll(loop, -1, axis=0)).all(axis=1))
+    if len(same):
+        raise ValueError(f"{name}: vertex {same[0]} at {loop[same[0]]} is repeated by the next; drop one")
+    return loop if _area(loop) > 0 else loop[::-1]
+
+
+def _area(loop: np.ndarray) -> float:
+    """Signed area by the shoelace formula, about the first vertex to keep digits."""
+    x, y = (loop - loop[0]).T
+    return float(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y)) / 2
+
+
+def check_crossings(loops: list[np.ndarray], names: list[str]) -> None:
+    """Raise if edges meet anywhere but at the vertex they share."""
+    a = np.concatenate(loops)
+    b = np.concatenate([np.roll(loop, -1, axis=0) for loop in loops])
+    owner = np.repeat(np.arange(len(loops)), [len(loop) for loop in loops])
+    number = np.concatenate([np.arange(len(loop)) for loop in loops])
+    after = np.concatenate([np.roll(np.arange(len(loop)), -1) for loop in loops])
+
+    def side(p, q, r):  # which side of pq is r on; zero within round-off
+        u, v = q - p, r - p
+        turn = u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
+        noise = 1e-12 * np.linalg.norm(u, axis=-1) * np.maximum(np.linalg.norm(v, axis=-1), np.linalg.norm(u, axis=-1))
+        return np.where(np.abs(turn) <= noise, 0.0, np.sign(turn))
+
+    for i in range(len(a) - 1):
+        p, q, c, d = a[i], b[i], a[i + 1 :], b[i + 1 :]
+        boxes = (np.maximum(c, d) >= np.minimum(p, q)).all(axis=1) & (np.minimum(c, d) <= np.maximum(p, q)).all(axis=1)
+        j = np.flatnonzero(boxes) + i + 1
+        c, d = a[j], b[j]
+        meet = (side(p, q, c) * side(p, q, d) <= 0) & (side(c, d, p) * side(c, d, q) <= 0)
+        follows = (owner[j] == owner[i]) & ((after[i] == number[j]) | (after[j] == number[i]))
+        # Neighbours meet at their vertex; they overlap only where one folds back onto the other.
+        folded = (side(p, q, c) == 0) & (side(p, q, d) == 0) & ((d - c) @ (q - p) < 0)
+        bad = j[meet & (~follows | folded)]
+        if len(bad):
+            k = bad[0]
+            one, two = names[owner[i]], names[owner[k]]
+            what = f"{one}: crosses or touches itself" if one == two else f"{two}: crosses or touches {one}"
+            raise ValueError(
+                f"{what}, the edge from {a[i]} to {b[i]} meets the one from {a[k]} to {b[k]}; "
+                "reorder or move the vertices (polygons that meet must be joined into one)"
+            )
+
+
+def check_nesting(loops: list[np.ndarray], names: list[str]) -> None:
+    """Raise unless every hole is inside of the outer polygon and of no other hole."""
+    for k in range(1, len(loops)):
+        if not _inside(loops[k][:1], loops[:1])[0]:
+            raise ValueError(
+                f"{names[k]}: lies outside of the polygon (its vertex {loops[k][0]}); holes must be inside of it"
+            )
+        for other in range(1, len(loops)):
+            if other != k and _inside(loops[k][:1], [loops[other]])[0]:
+                raise ValueError(f"{names[k]}: lies inside of {names[other]}; a hole in a hole cuts nothing, drop it")
+
+
+def _inside(x: np.ndarray, loops: list[np.ndarray]) -> np.ndarray:
+    """Even-odd rule for points (M, 2), in horizontal bands so that each point meets few edges."""
+    a = np.concatenate(loops)
+    b = np.concatenate([np.roll(loop, -1, axis=0) for loop in loops])
+    low, high = np.minimum(a[:, 1], b[:, 1]), np.maximum(a[:, 1], b[:, 1])
+    bands = int(np.clip(len(a) // 8, 1, 512))
+    cuts = np.linspace(low.min(), high.max(), bands + 1)
+    band = np.clip(np.searchsorted(cuts, x[:, 1], side="right") - 1, 0, bands - 1)
+    order = np.argsort(band, kind="stable")
+    ends = np.searchsorted(band[order], np.arange(bands + 1))
+    result = np.zeros(len(x), bool)
+    for k in range(bands):
+        rows = order[ends[k] : ends[k + 1]]
+        edges = np.flatnonzero((low <= cuts[k + 1]) & (high >= cuts[k]) & (high > low))
+        for some in np.array_split(edges, 1 + len(edges) * len(rows) // 2_000_000) if len(rows) else ():
+            (ax, ay), (bx, by) = a[some].T, b[some].T
+            px, py = x[rows, :1], x[rows, 1:]
+            across = ((ay > py) != (by > py)) & (px < ax + (py - ay) * ((bx - ax) / (by - ay)))
+            result[rows] ^= across.sum(axis=1) % 2 == 1
+    return result
+
+
+def edge_particles(loop: np.ndarray, spacing: Spacing, name: str) -> levelset.Boundary:
+    """Particles (B, 2) on the edges of a polygon and at its corners, outward normals right of the way."""
+    ahead = np.roll(loop, -1, axis=0)
+    edge = ahead - loop
+    normal = np.stack([edge[:, 1], -edge[:, 0]], axis=1) / np.linalg.norm(edge, axis=1, keepdims=True)
+    before = np.roll(normal, 1, axis=0)
+    turn = np.arctan2(np.abs(before[:, 0] * normal[:, 1] - before[:, 1] * normal[:, 0]), (before * normal).sum(axis=1))
+    paths = [_sampled(a, b, spacing) for a, b in zip(loop, ahead)]
+    lengths = np.array([filling.path_lengths(path, spacing)[-1] for path in paths])
+    if lengths.sum() < levelset.LEAST:
+        raise ValueError(
+            f"spacing: too coarse for the shape, {name} is only {lengths.sum():.2g} spacings round, "
+            f"at least {levelset.LEAST:g} are needed"
+        )
+    sharp = turn > _SHARP
+    tight = np.flatnonzero(sharp & np.roll(sharp, -1) & (lengths < 0.1))
+    if len(tight):
+        raise ValueError(
+            f"spacing: too coarse for the shape, the edge of {name} from {loop[tight[0]]} to {ahead[tight[0]]} is only "
+            f"{lengths[tight[0]]:.2g} spacings long; reduce the spacing there or simplify the polygon"
+        )
+    kept = sharp | (np.minimum(lengths, np.roll(lengths, 1)) > 0.75)
+    points, normals = [], []
+    first = int(np.argmax(kept))  # the first vertex if none is kept
+    stops = np.flatnonzero(np.roll(kept, -first))
+    stops = np.append(stops if len(stops) else [0], len(loop))
+    for i, j in zip(stops[:-1], stops[1:]):
+        numbers = (first + np.arange(i, j)) % len(loop)
+        path = np.concatenate([paths[k][:-1] for k in numbers] + [ahead[numbers[-1]][None]])
+        piece = np.concatenate([np.full(len(paths[k]) - 1, k) for k in numbers])
+        at, where = filling.divide(path, spacing)
+        points.append(at[:-1])
+        normals.append(normal[piece[where[:-1]]])
+        bisector = before[numbers[0]] + normal[numbers[0]]
+        normals[-1][0] = bisector / np.linalg.norm(bisector)
+    at, outward = np.concatenate(points), np.concatenate(normals)
+    firsts = np.cumsum([0] + [len(part) for part in points[:-1]])  # the vertices that are kept
+    order = np.concatenate([firsts, np.setdiff1d(np.arange(len(at)), firsts)])
+    order = order[filling.uncrowded(at[order], spacing(at[order]), len(firsts))]
+    return levelset.Boundary(at[np.sort(order)], outward[np.sort(order)])
+
+
+def _sampled(a: np.ndarray, b: np.ndarray, spacing: Spacing) -> np.ndarray:
+    """Points along an edge, close enough together to follow a variable spacing."""
+    path = a + np.linspace(0.0, 1.0, 17)[:, None] * (b - a)
+    count = min(100_000, int(8 * filling.path_lengths(path, spacing)[-1]))
+    return path if count < 17 else a + np.linspace(0.0, 1.0, count)[:, None] * (b - a)
+
+
+class PolygonRegion:
+    """Signed distance of a polygon with holes, by the nearest of many short pieces of its edges."""
+
+    def __init__(self, loops: list[np.ndarray], spacing: Spacing):
+        from scipy.spatial import cKDTree
+
+        self._loops = loops
+        chains = [
+            filling.divide(_sampled(a, b, spacing), spacing)[0]
+            for loop in loops
+            for a, b in zip(loop, np.roll(loop, -1, axis=0))
+        ]
+        self._start = np.concatenate([chain[:-1] for chain in chains])
+        self._step = np.concatenate([np.diff(chain, axis=0) for chain in chains])
+        self._tree = cKDTree(self._start + self._step / 2)
+
+    def distance(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Signed distance (M,), negative inside, and the unit direction of its growth (M, 2)."""
+        if not len(x):
+            return np.zeros(0), np.zeros((0, 2))
+        near = self._tree.query(x, k=min(6, len(self._start)))[1]
+        offset, step = x[:, None] - self._start[near], self._step[near]
+        along = np.clip((offset * step).sum(axis=2) / (step * step).sum(axis=2), 0.0, 1.0)
+        away = offset - along[..., None] * step
+        square = (away * away).sum(axis=2)
+        best = square.argmin(axis=1)
+        row = np.arange(len(x))
+        size = np.sqrt(square[row, best])
+        sign = np.where(_inside(x, self._loops), -1.0, 1.0)
+        return sign * size, away[row, best] * (sign / np.maximum(size, 1e-300))[:, None]

@@ -1,0 +1,166 @@
+"""Signed distances combined, moved, rounded and hollowed out; all of it is in ``js.sdf`` too."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from jsmitsm.cloud.sdf.vectors import norm, offset_from, positive, vector
+
+Sdf = Callable[[jax.Array], jax.Array]
+
+
+def union(*shapes: Sdf) -> Sdf:
+    """What lies in any of the shapes (the smallest distance; exact outside, a bound inside). ValueError without any.
+
+    >>> import jax.numpy as jnp, jsmitsm as js
+    >>> float(js.sdf.union(js.sdf.circle((0, 0), 1.0), js.sdf.circle((3, 0), 1.0))(jnp.array([3.0, 0.0])))
+    -1.0
+    """
+    return _combine(jnp.minimum, shapes)
+
+
+def intersection(*shapes: Sdf) -> Sdf:
+    """What lies in all of the shapes (the largest distance; exact inside, a bound outside). ValueError without any.
+
+    >>> import jax.numpy as jnp, jsmitsm as js
+    >>> float(js.sdf.intersection(js.sdf.circle((0, 0), 1.0), js.sdf.circle((1, 0), 1.0))(jnp.array([0.5, 0.0])))
+    -0.5
+    """
+    return _combine(jnp.maximum, shapes)
+
+
+def difference(shape: Sdf, *holes: Sdf) -> Sdf:
+    """What lies in ``shape`` and in none of the ``holes``. ValueError for what is no function.
+
+    >>> import jax.numpy as jnp, jsmitsm as js
+    >>> float(js.sdf.difference(js.sdf.circle((0, 0), 2.0), js.sdf.circle((0, 0), 1.0))(jnp.array([1.5, 0.0])))
+    -0.5
+    """
+    return intersection(shape, *map(complement, holes))
+
+
+def complement(shape: Sdf) -> Sdf:
+    """What lies outside of ``shape``.
+
+    >>> import jax.numpy as jnp, jsmitsm as js
+    >>> float(js.sdf.complement(js.sdf.circle((0, 0), 1.0))(jnp.array([0.0, 0.0])))
+    1.0
+    """
+    return lambda x: -shape(x)
+
+
+def smooth_union(first: Sdf, second: Sdf, radius: Any) -> Sdf:
+    """The union with its seam filled over a width ``radius`` (length units); quadratic blend, C1.
+
+    Raises ValueError for a width that is not positive.
+
+    >>> import jax.numpy as jnp, jsmitsm as js
+    >>> float(js.sdf.smooth_union(js.sdf.circle((-1, 0), 1.0), js.sdf.circle((1, 0), 1.0), 0.5)(jnp.zeros(2)))
+    -0.125
+    """
+    radius = positive("radius", radius)
+
+    def sdf(x: jax.Array) -> jax.Array:
+        a, b = first(x), second(x)
+        overlap = jnp.maximum(radius - jnp.abs(a - b), 0.0)
+        return jnp.minimum(a, b) - overlap**2 / (4.0 * radius)
+
+    return sdf
+
+
+def translate(shape: Sdf, offset: Any) -> Sdf:
+    """The shape moved by ``offset`` (D,). Raises ValueError for what is no vector.
+
+    >>> import jax.numpy as jnp, jsmitsm as js
+    >>> float(js.sdf.translate(js.sdf.circle((0, 0), 1.0), (3, 0))(jnp.array([3.0, 0.0])))
+    -1.0
+    """
+    offset = vector("offset", offset)
+    return lambda x: shape(offset_from(x, offset))
+
+
+def scale(shape: Sdf, factor: Any, center: Any = None) -> Sdf:
+    """The shape enlarged by ``factor`` > 0 about ``center`` (the origin by default). ValueError for another factor.
+
+    >>> import jax.numpy as jnp, jsmitsm as js
+    >>> float(js.sdf.scale(js.sdf.circle((0, 0), 1.0), 3.0)(jnp.zeros(2)))
+    -3.0
+    """
+    factor = positive("factor", factor)
+    middle = 0.0 if center is None else vector("center", center)
+    return lambda x: factor * shape(middle + (x - middle) / factor)
+
+
+def rotate(shape: Sdf, angle: Any, center: Any = None, axis: Any = None) -> Sdf:
+    """The shape turned by ``angle`` (radians, counter-clockwise) about ``center`` (the origin by default).
+
+    In 3D about the line through ``center`` along ``axis`` (3,), by the right-hand rule.
+    Raises ValueError, when called, for a 3D point without an axis and for a 2D one with it.
+
+    >>> import jax.numpy as jnp, jsmitsm as js
+    >>> upright = js.sdf.rotate(js.sdf.rectangle((0, 0), (2, 1)), jnp.pi / 2)
+    >>> print(f"{upright(jnp.array([-0.5, 1.0])):.3f}")
+    -0.500
+    """
+    middle = 0.0 if center is None else vector("center", center)
+    direction = None if axis is None else vector("axis", axis, 3)
+
+    def sdf(x: jax.Array) -> jax.Array:
+        if x.shape[0] == 1 or (x.shape[0] == 3) != (direction is not None):
+            raise ValueError(
+                f"axis: {axis} came with a point in {x.shape[0]}D; 3D needs an axis (3,), 2D takes none, 1D has none"
+            )
+        c, s, y = jnp.cos(angle), jnp.sin(angle), x - middle
+        if direction is None:
+            turned = jnp.stack([c * y[0] + s * y[1], c * y[1] - s * y[0]])
+        else:
+            unit = direction / norm(direction)  # Rodrigues' formula with the opposite angle
+            turned = c * y - s * jnp.cross(unit, y) + (1.0 - c) * jnp.dot(unit, y) * unit
+        return shape(middle + turned)
+
+    return sdf
+
+
+def round(shape: Sdf, radius: Any) -> Sdf:
+    """The shape grown by ``radius``, its convex corners rounded with it (exact distances only).
+
+    To keep the size, shrink the shape first: ``round(box(lo + r, hi - r), r)``.
+    Raises ValueError for a radius that is not positive.
+
+    >>> import jax.numpy as jnp, jsmitsm as js
+    >>> float(js.sdf.round(js.sdf.rectangle((0, 0), (2, 1)), 0.25)(jnp.array([1.0, 2.0])))
+    0.75
+    """
+    radius = positive("radius", radius)
+    return lambda x: shape(x) - radius
+
+
+def shell(shape: Sdf, thickness: Any) -> Sdf:
+    """The wall of the given thickness with the boundary of ``shape`` in its middle.
+
+    Raises ValueError for a thickness that is not positive.
+
+    >>> import jax.numpy as jnp, jsmitsm as js
+    >>> float(js.sdf.shell(js.sdf.circle((0, 0), 1.0), 0.5)(jnp.array([1.0, 0.0])))
+    -0.25
+    """
+    half = positive("thickness", thickness) / 2
+    return lambda x: jnp.abs(shape(x)) - half
+
+
+def _combine(pick: Callable[[jax.Array, jax.Array], jax.Array], shapes: Sequence[Sdf]) -> Sdf:
+    """Fold the values of all shapes with min or max."""
+    if not shapes or not all(map(callable, shapes)):
+        raise ValueError(f"shapes: expected one or more functions x -> scalar, got {shapes!r}; pass them one by one")
+
+    def sdf(x: jax.Array) -> jax.Array:
+        value = shapes[0](x)
+        for shape in shapes[1:]:
+            value = pick(value, shape(x))
+        return value
+
+    return sdf

@@ -1,0 +1,175 @@
+"""The numbers of a problem: Taylor coefficients of its operator and source, and its conditions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from jsmitsm.discretization.layout import Discretization, crowded
+from jsmitsm.equation.conditions import merged
+from jsmitsm.equation.problem import Problem
+from jsmitsm.particle.recursion import Recursion, source_rows
+from jsmitsm.runtime.tracers import is_traced
+from jsmitsm.runtime.whole_program import in_one_program, picked
+from jsmitsm.taylor.multi_indices import Slot, factorial, index_of, multi_indices
+from jsmitsm.taylor.series import Ring, mul
+
+# Coefficients and sources up to this have squares that are numbers.
+LARGEST = 1e150
+
+
+@dataclass
+class Numbers:
+    """The numbers of a linear (or linearised) problem: everything that may be traced.
+
+    jac (E, S, T, n or 1) and source (rows, n or 1) at the particles ``ids`` (ascending); own (m, n_own, S) and
+    given (m, n_own) at the particles ``own_ids``; held (N, F); data (N, n_data, S) and gamma
+    (N, n_data), the conditions that neighbours use.
+    """
+
+    ids: np.ndarray
+    jac: Any
+    source: Any
+    own_ids: np.ndarray
+    own: Any
+    given: Any
+    held: Any
+    data: Any
+    gamma: Any
+
+
+def numbers(disc: Discretization, problem: Problem, taylor: Any = None, everywhere: bool = False) -> Numbers:
+    """Evaluate the operator's Taylor coefficients, the source and the conditions.
+
+    taylor (N, F, K): the current local expansions, where the problem is nonlinear.
+    everywhere: also at particles whose values are held, which carry no equation.
+    """
+    everywhere = everywhere or disc.scheme.method in ("I", "II")  # neighbours recover derivatives too
+    ids = np.arange(len(disc.cloud)) if everywhere else disc.active
+    here = None if taylor is None else picked(taylor, ids)
+    jac, source = operator_numbers(disc, problem, picked(disc.cloud.points, ids), here)
+    held = [((group.ids, k), value()) for group in disc.groups for k, value in group.held.items()]
+    own_ids, own, given = _own_numbers(disc, taylor)
+    data, gamma = _data_numbers(disc, taylor)
+    return Numbers(ids, jac, source, own_ids, own, given, _filled(np.zeros(disc.held.shape), held), data, gamma)
+
+
+def operator_numbers(disc: Discretization, problem: Problem, points: Any, taylor: Any) -> tuple[Any, Any]:
+    """Taylor coefficients of the (linearised) operator and the right-hand side of the recursion."""
+    rec, traced = disc.rec, disc.traced
+    if traced.linear:
+        jac, res = traced.coefficients(points, rec.degree, params=problem.params)
+        if res is None:
+            _refuse_nonfinite(points, jac)
+            return jac, np.zeros((rec.n_rows, 1))
+    else:
+        # The residual linearised about the local expansion U: R(U) + R'(U) (u - U) = 0.
+        at = slot_series(rec, traced.slots, taylor, rec.degree)
+        jac, res = traced.coefficients(points, rec.degree, params=problem.params, slots=at)
+        res = _moved(rec, jac, res, at)
+    if traced.linear:
+        _refuse_nonfinite(points, jac, res)
+    return jac, source_rows(rec, res)
+
+
+@partial(in_one_program, static=("rec",))
+def _moved(rec: Recursion, jac: Any, res: Any, at: Any) -> Any:
+    """R(U) - R'(U) U: the residual (E, T, n) of a linearised operator at u = 0."""
+    ring = Ring(rec.dim, rec.degree)
+    for e in range(jac.shape[0]):
+        change = sum(mul(ring, jac[e, s], at[s]) for s in range(len(rec.slots)) if rec.pattern[e][s])
+        res = _filled(res, [(e, res[e] - change)])
+    return res
+
+
+def _refuse_nonfinite(points: Any, *series: Any) -> None:
+    """Name the point where the operator or the source is not a number, or its squares are none."""
+    for values in series:
+        if is_traced(values, points) or float(np.max(np.abs(values), initial=0.0)) < LARGEST:
+            continue
+        if np.isfinite(values).all():
+            raise ValueError(
+                f"pde: numbers up to {np.abs(values).max():.0e}, whose squares leave the range of floats; divide the "
+                "equation by a number of their size, or use other units"
+            )
+        bad = np.flatnonzero(~np.isfinite(np.asarray(values)).all(axis=tuple(range(np.ndim(values) - 1))))
+        raise ValueError(
+            f"pde: NaN or infinity at {len(bad)} particle(s), first at x = {np.asarray(points)[bad[0]]}, in the "
+            "coefficients, the source or their derivatives; they must be finite and smooth there"
+        )
+
+
+def slot_series(rec: Recursion, slots: tuple[Slot, ...], taylor: Any, degree: int) -> Any:
+    """Taylor coefficients (S, T, n) of the slots' derivatives from local expansions (n, F, K)."""
+    return _derivatives(taylor, rec, slots, degree)
+
+
+@partial(in_one_program, static=("rec", "slots", "degree"))
+def _derivatives(taylor: Any, rec: Recursion, slots: tuple[Slot, ...], degree: int) -> Any:
+    place = index_of(rec.dim, rec.order)
+    out = []
+    for f, b in slots:
+        up = [tuple(ti + bi for ti, bi in zip(t, b)) for t in multi_indices(rec.dim, degree)]
+        index = np.array([place.get(a, 0) for a in up])
+        factor = np.array(
+            [factorial(a) / factorial(t) if a in place else 0.0 for a, t in zip(up, multi_indices(rec.dim, degree))]
+        )
+        out.append((taylor[:, f][:, index] * factor).T)
+    return (jnp if is_traced(taylor) else np).stack(out)
+
+
+def _slot_values(slots: tuple[Slot, ...], rec: Recursion, taylor: Any, ids: np.ndarray) -> Any:
+    """Derivatives (S, n) of the local expansions at the particles themselves."""
+    return None if taylor is None else slot_series(rec, slots, taylor[ids], 0)[:, 0]
+
+
+def _own_numbers(disc: Discretization, taylor: Any) -> tuple[np.ndarray, Any, Any]:
+    """Every conditioned particle's own conditions: held values first, then the functionals."""
+    slots, zero = disc.scheme.own, (0,) * disc.rec.dim
+    ids = np.flatnonzero(disc.n_own)
+    most = int(disc.n_own.max(initial=0))
+    own: list[Any] = []
+    given: list[Any] = []
+    for group in disc.groups:
+        at = np.searchsorted(ids, group.ids)
+        for row, (k, value) in enumerate(group.held.items()):
+            own.append(((at, row, slots.index((k, zero))), 1.0))
+            given.append(((at, row), value()))
+        if group.parts:
+            coef, value = merged(group, slots, _slot_values(slots, disc.rec, taylor, group.ids))
+            index = (at[:, None], (len(group.held) + np.arange(coef.shape[1]))[None, :])
+            own.append((index, coef))
+            given.append((index, value))
+    return ids, _filled(np.zeros((len(ids), most, len(slots))), own), _filled(np.zeros((len(ids), most)), given)
+
+
+def _data_numbers(disc: Discretization, taylor: Any) -> tuple[Any, Any]:
+    """The conditions of particles whose values are all held, as data for their neighbours."""
+    scheme, n = disc.scheme, len(disc.cloud)
+    data: list[Any] = []
+    gamma: list[Any] = []
+    for group in disc.groups:
+        if crowded(group, disc.rec):
+            coef, value = merged(group, scheme.data, _slot_values(scheme.data, disc.rec, taylor, group.ids))
+            index = (group.ids[:, None], np.arange(coef.shape[1])[None, :])
+            data.append((index, coef))
+            gamma.append((index, value))
+    shape = (n, scheme.n_data)
+    return _filled(np.zeros((*shape, len(scheme.data))), data), _filled(np.zeros(shape), gamma)
+
+
+@in_one_program
+def _filled(array: Any, places: list[tuple[Any, Any]]) -> Any:
+    """A copy of the array with array[index] = value for every pair of ``places``."""
+    if is_traced(array, places):
+        for index, value in places:
+            array = jnp.asarray(array).at[index].set(value)
+        return array
+    array = np.array(array)
+    for index, value in places:
+        array[index] = np.asarray(value)
+    return array

@@ -1,0 +1,300 @@
+"""What is static about a problem on a cloud: conditions, methods and classes of particles, decided once on the host."""
+
+from __future__ import annotations
+
+import inspect
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax
+import numpy as np
+
+from jsmitsm.cloud.cloud import Cloud
+from jsmitsm.cloud.neighbours import Stencils
+from jsmitsm.discretization.periodic import Images, periodic_images, with_corners
+from jsmitsm.discretization.supports import check_supports, cut_off, default_kernel, find_stencils
+from jsmitsm.equation.closing import closed, in_words
+from jsmitsm.equation.conditions import Group, group_conditions
+from jsmitsm.equation.problem import Problem
+from jsmitsm.equation.tracing import Traced, trace
+from jsmitsm.particle.elimination import Scheme
+from jsmitsm.particle.kernels import Constant, Kernel
+from jsmitsm.particle.recursion import Recursion, free_indices, recursion
+from jsmitsm.runtime.compiled import at_hand
+from jsmitsm.runtime.tracers import is_traced, owned
+
+
+@dataclass
+class Class:
+    """Particles whose moment systems have the same shape.
+
+    ids (n,) ascending, neighbours (n, w), the particle itself first and -1 for none; wide: whether their stencils are
+    wider than those of most.
+    """
+
+    ids: np.ndarray
+    neighbours: Any
+    scheme: Scheme
+    wide: bool = False
+
+
+@dataclass
+class Discretization:
+    """What is static about a problem on a cloud: decided once, on the host."""
+
+    problem: Problem  # closed: nothing of it is the user's any more
+    cloud: Cloud
+    kernel: Kernel | None
+    stencils: Stencils
+    traced: Traced
+    rec: Recursion
+    groups: list[Group]
+    scheme: Scheme  # of interior particles
+    classes: list[Class]
+    held: np.ndarray  # (N, F) bool, values given or taken from a periodic partner
+    partner: np.ndarray  # (N,) the particle whose value each one has: itself but for periodic images
+    images: Images
+    n_own: np.ndarray  # (N,) own conditions of each particle
+    given_stencils: bool  # the user's: nothing outside them is looked at
+    basis_terms: int | None = None  # free coefficients kept, all of them if not given
+    repeated: int = 0  # particles whose moment system was that of another
+    cut_off: tuple[int, ...] = ()  # particles whose support reaches outside of the given stencil
+    lengths: int = 0  # eliminations of a constant operator, where one for all is not enough
+
+    @property
+    def points(self) -> Any:
+        """The particles (N, D), followed by their periodic images."""
+        return self.images.extend(self.cloud.points)
+
+    @property
+    def linear(self) -> bool:
+        return self.traced.linear and all(g.linear for g in self.groups)
+
+    @property
+    def floating(self) -> tuple[int, ...]:
+        """Fields that the problem determines only up to a constant: no value of theirs enters."""
+        zero = (0,) * self.rec.dim
+        values = {f for f, b in (*self.rec.slots, *self.scheme.own) if b == zero}
+        return tuple(f for f in range(self.rec.fields) if f not in values) if self.linear else ()
+
+    @property
+    def active(self) -> np.ndarray:
+        """The particles that carry equations, ascending."""
+        return np.flatnonzero(~self.held.all(axis=1))
+
+    @property
+    def unknowns(self) -> np.ndarray:
+        """The number of each unknown among all values, (N, F); -1 for held ones."""
+        number = np.full(self.held.size, -1)
+        free = ~self.held.reshape(-1)
+        number[free] = np.arange(free.sum())
+        return number.reshape(self.held.shape)[self.partner]
+
+
+def discretize(
+    problem: Problem, cloud: Cloud, method: str, order: int, kernel: Kernel | None,
+    stencils: Stencils | None, basis_terms: int | None, sources: bool = True,
+) -> Discretization:  # fmt: skip
+    """Trace the problem, lay out its recursion and conditions, and find neighbours.
+
+    sources: whether the weights of the source are wanted even where it is zero.
+    """
+    traced = _traced(problem, cloud.dim)
+    _check_operator(traced, problem, order)
+    problem = closed(problem, traced)
+    kernel, stencils = jax.tree.map(owned, (kernel, stencils))
+    rec = recursion(cloud.dim, order, problem.fields, traced.slots, traced.pattern, traced.order)
+    groups = group_conditions(problem, with_corners(problem, cloud), order, traced.order)
+    held = np.zeros((len(cloud), problem.fields), bool)
+    for group in groups:
+        for k in group.held:
+            held[group.ids, k] = True
+    images, partner = periodic_images(problem, cloud)
+    held[partner != np.arange(len(cloud))] = True
+    n_own = np.zeros(len(cloud), int)
+    for group in groups:
+        n_own[group.ids] = group.n_rows + len(group.held)
+    scheme = _scheme(method, rec, traced, problem, cloud, basis_terms)
+    sourced = sources or not traced.linear or traced.source != "zero"
+    scheme = replace(scheme, **_conditions_layout(groups, rec), sourced=sourced)
+    if len(images.owner) and method in ("I", "II"):
+        raise ValueError(f"method: {method} does not follow periodic conditions; use S, III or SSPH")
+    if scheme.n_data and method in ("I", "II", "III"):
+        raise ValueError(
+            f"method: {method} takes one condition where values are held, but a boundary has more (as a clamped "
+            'plate has); use "S" or "SSPH"'
+        )
+    if method == "SSPH":
+        _check_collocated(groups, problem.fields)
+    if kernel is not None and not is_traced(kernel) and np.shape(kernel.h) not in ((), (len(cloud),)):
+        raise ValueError(
+            f"kernel: h has shape {np.shape(kernel.h)}, expected a scalar or one per particle, ({len(cloud)},)"
+        )
+    if isinstance(kernel, Constant) and method in ("II", "III"):
+        raise ValueError(
+            f"kernel: the derivatives of js.Constant vanish, and method {method} tests with them; use another kernel"
+        )
+    given_stencils = stencils is not None
+    if stencils is None:
+        stencils = find_stencils(cloud, kernel, scheme, images, np.flatnonzero((n_own > 0) & ~held.all(axis=1)))
+    elif len(stencils) != len(cloud):
+        raise ValueError(f"stencils: built for {len(stencils)} particles, the cloud has {len(cloud)}; build them again")
+    if kernel is None and method in ("I", "II"):
+        kernel = default_kernel(cloud.points, np.arange(len(cloud)), stencils.indices)
+    disc = Discretization(
+        problem, cloud, kernel, stencils, traced, rec, groups, scheme, [], held, partner, images, n_own, given_stencils,
+        basis_terms,
+    )  # fmt: skip
+    if given_stencils or kernel is not None:
+        check_supports(scheme, stencils, kernel, disc.points, n_own, disc.active)
+    if given_stencils and kernel is not None:
+        disc.cut_off = cut_off(stencils, kernel, disc.points, disc.active)
+    disc.classes = sorted_classes(disc, disc.active, stencils)
+    return disc
+
+
+def _check_collocated(groups: list[Group], fields: int) -> None:
+    """A particle of SSPH states its equations or its conditions, as many of either as there are fields."""
+    for group in groups:
+        count = len(group.held) + group.n_rows
+        if count not in (0, fields) and len(group.held) < fields:
+            raise ValueError(
+                f"bcs[{group.name!r}]: {count} condition(s) for {fields} field(s), but method SSPH puts a condition in "
+                f'the place of every equation there and takes {fields}, or none (js.free()); use method="S"'
+            )
+
+
+def sorted_classes(disc: Discretization, ids: np.ndarray, stencils: Stencils) -> list[Class]:
+    """The particles ``ids`` sorted by the number of their own conditions and the width of their stencils."""
+    near = stencils.indices
+    if is_traced(near):
+        wide = np.zeros(len(ids), bool)
+        used = [near.shape[1]] * 2
+    else:
+        counts = np.max(np.where(near[ids] >= 0, np.arange(near.shape[1]), 0), axis=1, initial=0) + 1
+        narrow = int(np.sort(counts)[4 * (len(ids) - 1) // 5]) if len(ids) else 1
+        wide = counts > 1.25 * narrow
+        widest = int(counts[~wide].max(initial=1)), near.shape[1]
+        used = [_width_at_hand(disc.scheme, rounded_width(width)) for width in widest]
+        near = np.pad(near, ((0, 0), (0, max(0, max(used) - near.shape[1]))), constant_values=-1)
+    classes = []
+    for count in np.unique(disc.n_own[ids]):
+        for k, width in enumerate(used):
+            some = ids[(disc.n_own[ids] == count) & (wide == k)]
+            if len(some):
+                classes.append(Class(some, near[some][:, :width], replace(disc.scheme, n_own=int(count)), bool(k)))
+    return classes
+
+
+def rounded_width(width: int, step: int = 4) -> int:
+    """Widths of stencils come in steps, so that another support seldom needs another program."""
+    return width if width <= 5 else -(-width // step) * step
+
+
+# The widths that programs of a scheme were asked for; forgotten ones only compile again.
+_widths: dict[Scheme, set[int]] = {}
+_MOST_SCHEMES = 256
+
+
+def _width_at_hand(scheme: Scheme, width: int) -> int:
+    """This width, or one little larger that another cloud had: it finds its program compiled.
+
+    In 3D, where widths vary more and compiling takes longer, up to a quarter larger; else an eighth.
+    """
+    if len(_widths) >= _MOST_SCHEMES:
+        _widths.clear()
+    most = (1.25 if scheme.rec.dim == 3 else 1.125) * width
+    return at_hand(_widths.setdefault(scheme, set()), width, most, width)
+
+
+def table(disc: Discretization) -> Any:
+    """All stencils in one padded array (N, w), repaired ones too."""
+    near = disc.stencils.indices
+    if is_traced(near) or not disc.classes:
+        return near
+    width = max(near.shape[1], *(c.neighbours.shape[1] for c in disc.classes))
+    out = np.full((len(near), width), -1, np.int32)
+    out[:, : near.shape[1]] = near
+    for c in disc.classes:
+        out[c.ids] = -1
+        out[c.ids, : c.neighbours.shape[1]] = c.neighbours
+    return out
+
+
+def _conditions_layout(groups: list[Group], rec: Recursion) -> dict[str, Any]:
+    """The slots of all own conditions, and of those that only neighbours can use.
+
+    A particle has one equation for every field. What a group has more than that (the slope of a clamped plate, whose
+    values are held, the moment beside the shear force of a free end) reaches the others as data of the neighbours.
+    """
+    zero = (0,) * rec.dim
+    own = tuple(dict.fromkeys(slot for g in groups for slot in [*((k, zero) for k in g.held), *g.slots]))
+    passed = [g for g in groups if crowded(g, rec)]
+    data = tuple(dict.fromkeys(slot for g in passed for slot in g.slots))
+    return {"own": own, "data": data, "n_data": max((g.n_rows for g in passed), default=0)}
+
+
+def crowded(group: Group, rec: Recursion) -> bool:
+    """Whether a group has more conditions than its particles have equations to carry them."""
+    return bool(group.parts) and len(group.held) + group.n_rows > rec.fields
+
+
+def _traced(problem: Problem, dim: int) -> Traced:
+    """The residual recorded; whatever goes wrong in it is said to be the pde's."""
+    if isinstance(problem.pde, Traced):
+        return problem.pde
+    expected = "pde(u, x)" if problem.params is None else "pde(u, x, params)"
+    try:
+        inspect.signature(problem.pde).bind(*([None] * (2 if problem.params is None else 3)))
+    except TypeError as error:
+        raise ValueError(
+            f"pde: {error}; it is called as {expected}, with params last where the problem has them"
+        ) from None
+    except ValueError:  # a callable without a signature
+        pass
+    try:
+        return trace(problem.pde, dim, problem.fields, params=problem.params)
+    except (TypeError, ValueError, IndexError) as error:
+        text = in_words(error)
+        raise ValueError(text if text.startswith("pde") else f"pde: {text}; it returns a number or a scalar per "
+                         "equation") from error  # fmt: skip
+
+
+def _check_operator(traced: Traced, problem: Problem, order: int) -> None:
+    if traced.n_equations != problem.fields:
+        raise ValueError(
+            f"pde: returns {traced.n_equations} residual(s) for fields={problem.fields}; "
+            "a system of F fields needs F residuals"
+        )
+    for e, m in enumerate(traced.order):
+        if m < 0:
+            raise ValueError(f"pde: residual {e} does not depend on u; use u(x), js.grad(u)(x), js.laplacian(u)(x) ...")
+        if m > order:
+            raise ValueError(
+                f"order: {order} is below the order {m} of the equation; use order={m} or more (even orders pay)"
+            )
+    for k in range(problem.fields):
+        if not any(f == k for f, _ in traced.slots):
+            raise ValueError(f"pde: field {k} appears in no equation; lower fields={problem.fields} or use it")
+
+
+def _scheme(method: str, rec: Recursion, traced: Traced, problem: Problem, cloud: Cloud, basis_terms: Any) -> Scheme:
+    """The method and its free coefficients."""
+    if method in ("S", "SSPH"):
+        if basis_terms is not None:
+            raise ValueError(f"basis_terms: only I, II and III keep single free coefficients, not method={method!r}")
+        return Scheme(method, rec)
+    if problem.fields > 1:
+        raise ValueError(f'method: {method} treats one field, the problem has {problem.fields}; use method="S"')
+    slots = None if traced.linear else np.zeros((len(traced.slots), 1, len(cloud)))
+    jac, _ = traced.coefficients(cloud.points, 0, params=problem.params, slots=slots)
+    jac = None if is_traced(jac) else np.asarray(jac)[0, :, 0]
+    free, dependent = free_indices(rec, jac)
+    if basis_terms is not None:
+        whole = isinstance(basis_terms, (int, np.integer)) and not isinstance(basis_terms, bool)
+        if not whole or not 1 <= basis_terms <= len(free):
+            raise ValueError(
+                f"basis_terms: expected 1 to {len(free)} free coefficients at this order, got {basis_terms!r}"
+            )
+        free = free[:basis_terms]
+    return Scheme(method, rec, tuple(map(int, free)), tuple(map(int, dependent)))

@@ -1,0 +1,89 @@
+"""What kind of equation it is: whether information travels in it, how convective it is, how long its waves are."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from jsmitsm.discretization.coefficients import Numbers
+from jsmitsm.discretization.layout import Discretization
+from jsmitsm.particle.recursion import Recursion
+from jsmitsm.runtime.tracers import concrete, is_traced
+
+
+def prefers_least_squares(disc: Discretization, nums: Numbers) -> bool:
+    """Whether information travels: operators of first order, hyperbolic and parabolic ones of second,
+    and those whose convection outweighs diffusion between neighbours (cell Peclet number above 2).
+
+    There a value predicted by neighbours on all sides is the wrong global form.
+    """
+    rec, jac = disc.rec, concrete(nums.jac)
+    jac = None if jac is None else np.asarray(jac)  # where it only carries derivatives, no operation is recorded
+    orders = {rec.order - q for q in rec.degrees}
+    if disc.scheme.method != "S" or rec.fields > 1:
+        return False
+    if orders == {1}:
+        return True
+    if orders != {2}:
+        return False
+    if _timelike(rec):
+        return True
+    if jac is None:
+        return False
+    symbol = np.zeros((jac.shape[-1], rec.dim, rec.dim))
+    for s, (_, b) in enumerate(rec.slots):
+        if sum(b) == 2:
+            i, j = [axis for axis in range(rec.dim) for _ in range(b[axis])]
+            symbol[:, i, j] += jac[0, s, 0] / 2
+            symbol[:, j, i] += jac[0, s, 0] / 2
+    values = np.linalg.eigvalsh(symbol)
+    diffusion = np.abs(values).max(axis=1)
+    if (values[:, 0] * values[:, -1] < -1e-10 * diffusion**2).any():
+        return True
+    drift = [s for s, (_, b) in enumerate(rec.slots) if sum(b) == 1]
+    if not drift or concrete(disc.cloud.points) is None:
+        return False
+    speed = np.linalg.norm(jac[0, drift, 0], axis=0)
+    return bool(np.median(speed * mean_spacing(disc) / diffusion) > 2.0)
+
+
+def _timelike(rec: Recursion) -> bool:
+    """Whether an axis enters by a first derivative only, as time does in a heat equation."""
+    second = {axis for _, b in rec.slots if sum(b) == 2 for axis in range(rec.dim) if b[axis]}
+    first = {b.index(1) for _, b in rec.slots if sum(b) == 1}
+    return bool(first - second)
+
+
+def cell_peclet(disc: Discretization, nums: Numbers) -> float:
+    """Convection over diffusion between neighbours, the median over the particles; 0 where it has no meaning."""
+    rec = disc.rec
+    drift = [s for s, (_, b) in enumerate(rec.slots) if sum(b) == 1]
+    second = [s for s, (_, b) in enumerate(rec.slots) if sum(b) == 2]
+    orders = {rec.order - q for q in rec.degrees}
+    if rec.fields > 1 or orders != {2} or not drift or not second or is_traced(nums.jac, disc.cloud.points):
+        return 0.0
+    jac = np.asarray(nums.jac)[0, :, 0]
+    speed, diffusion = np.linalg.norm(jac[drift], axis=0), np.abs(jac[second]).max(axis=0)
+    return float(np.median(speed * mean_spacing(disc) / np.where(diffusion > 0, diffusion, np.inf)))
+
+
+def mean_spacing(disc: Discretization) -> float:
+    """The edge of the cube that each particle has for itself."""
+    points = np.asarray(concrete(disc.cloud.points))
+    return float((np.prod(np.ptp(points, axis=0)) / len(points)) ** (1.0 / disc.rec.dim))
+
+
+def wave_number(disc: Discretization, nums: Numbers) -> float:
+    """k of an operator such as laplacian(u) + k^2 u, the median over the particles; 0 where it has no waves."""
+    rec = disc.rec
+    zero = [s for s, (_, b) in enumerate(rec.slots) if sum(b) == 0]
+    pure = [s for s, (_, b) in enumerate(rec.slots) if sum(b) == 2 and max(b) == 2]
+    orders = {rec.order - q for q in rec.degrees}
+    if rec.fields > 1 or orders != {2} or not zero or not pure or is_traced(nums.jac, disc.cloud.points):
+        return 0.0
+    jac = np.asarray(nums.jac)[0, :, 0]
+    second = jac[pure]
+    # A wave equation in space and time has second derivatives of both signs: another matter.
+    if (second.min(axis=0) * second.max(axis=0) <= 0).any():
+        return 0.0
+    square = np.median(jac[zero[0]] / second[np.argmax(np.abs(second), axis=0), np.arange(second.shape[1])])
+    return float(np.sqrt(max(square, 0.0)))

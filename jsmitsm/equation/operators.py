@@ -1,0 +1,180 @@
+"""Differential operators acting on a local field, or on any function of a point."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jsmitsm.equation.field import Field, LocalField, total, unit
+from jsmitsm.taylor.multi_indices import MultiIndex
+
+
+def partial(u: Any, multi_index: MultiIndex | int) -> Any:
+    """The derivative d^a u, a function of the point.
+
+    Parameters: ``u``, a field or any function of a point (D,); ``multi_index``, D
+    non-negative integers, the order along each axis (in 1D an integer will do).
+    Raises ``ValueError`` if its length is not D.
+
+    >>> import jax.numpy as jnp
+    >>> float(partial(lambda y: y[0] ** 2 * y[1], (1, 1))(jnp.array([3.0, 5.0])))
+    6.0
+    """
+    index = (multi_index,) if isinstance(multi_index, int) else tuple(int(k) for k in multi_index)
+    if isinstance(u, Field):
+        return u._shifted(index)
+    if isinstance(u, LocalField):
+        return u._map(lambda f: f._shifted(index))
+
+    def derivative(x: Any) -> Any:
+        x = _point(x)
+        if len(index) != len(x) or any(k < 0 for k in index):
+            raise ValueError(f"multi_index must be {len(x)} non-negative integers, got {index}")
+        function = _array_valued(u)
+        for axis, times in enumerate(index):
+            for _ in range(times):
+                function = _along(function, axis)
+        return function(x)
+
+    return derivative
+
+
+def grad(u: Any) -> Any:
+    """The gradient of ``u``, a function of the point; derivatives on the last axis.
+
+    ``grad(u)(x)`` is (D,) for a scalar ``u``, (F, D) for a vector.  ``u`` is a field or any
+    function of a point (D,). Raises ``ValueError`` for what is neither.
+
+    >>> import jax.numpy as jnp
+    >>> grad(lambda y: y[0] * y[1])(jnp.array([3.0, 5.0])).tolist()
+    [5.0, 3.0]
+    """
+    if isinstance(u, Field):
+        return LocalField(u.dim, [u._shifted(unit(u.dim, i)) for i in range(u.dim)])
+    if isinstance(u, LocalField):
+        return u._map(grad)
+    function = _array_valued(u)
+    return lambda x: jnp.stack([_along(function, i)(_point(x)) for i in range(len(_point(x)))], -1)
+
+
+def hessian(u: Any) -> Any:
+    """The second derivatives of ``u``, a function of the point: (D, D), or (F, D, D).
+
+    Raises ``ValueError`` for what is neither a field nor a function.
+
+    >>> import jax.numpy as jnp
+    >>> hessian(lambda y: y[0] ** 2 * y[1])(jnp.array([3.0, 5.0])).tolist()
+    [[10.0, 6.0], [6.0, 0.0]]
+    """
+    if isinstance(u, Field | LocalField):
+        return grad(grad(u))
+    function = _array_valued(u)
+
+    def matrix(x: Any) -> jax.Array:
+        x = _point(x)
+        dim = len(x)
+        upper = {
+            (i, j): _along(_along(function, i), j)(x) for i, j in itertools.combinations_with_replacement(range(dim), 2)
+        }
+        rows = [jnp.stack([upper[min(i, j), max(i, j)] for j in range(dim)], -1) for i in range(dim)]
+        return jnp.stack(rows, -2)
+
+    return matrix
+
+
+def laplacian(u: Any) -> Any:
+    """The sum of the second derivatives of ``u``, a function of the point: a scalar, or (F,).
+
+    Raises ``ValueError`` for what is neither a field nor a function.
+
+    >>> import jax.numpy as jnp
+    >>> float(laplacian(lambda y: y[0] ** 2 * y[1])(jnp.array([3.0, 5.0])))
+    10.0
+    """
+    if isinstance(u, Field):
+        return total(u._shifted(tuple(2 * k for k in unit(u.dim, i))) for i in range(u.dim))
+    if isinstance(u, LocalField):
+        return u._map(laplacian)
+    function = _array_valued(u)
+    return lambda x: total(_along(_along(function, i), i)(_point(x)) for i in range(len(_point(x))))
+
+
+def divergence(v: Any) -> Any:
+    """The divergence of ``v``, a function of the point, summed over the last axis.
+
+    ``v(x)`` is (D,) (the result a scalar) or (F, D) (row by row: F values).  Raises
+    ``ValueError`` if the last axis is not of length D.
+
+    >>> import jax.numpy as jnp
+    >>> float(divergence(lambda y: y ** 2)(jnp.array([3.0, 5.0])))
+    16.0
+    """
+    if isinstance(v, Field):
+        raise ValueError("v must be a vector field with D components, got a scalar field; did you mean grad(u)?")
+    if isinstance(v, LocalField):
+        _check_last_axis(v.shape, v.dim)
+        rows = (slice(None),) * (v.ndim - 1)
+        return total(partial(v[(*rows, i)], unit(v.dim, i)) for i in range(v.dim))
+    function = _array_valued(v)
+
+    def total_slope(x: Any) -> Any:
+        x = _point(x)
+        dim = len(x)
+
+        def component(i: int) -> Callable[[Any], Any]:
+            def part(y: Any) -> Any:
+                value = function(y)
+                _check_last_axis(value.shape, dim)
+                return value[..., i]
+
+            return part
+
+        return total(_along(component(i), i)(x) for i in range(dim))
+
+    return total_slope
+
+
+def _check_last_axis(shape: tuple[int, ...], dim: int) -> None:
+    if not shape or shape[-1] != dim:
+        raise ValueError(
+            f"v must give {dim} components on its last axis, one per dimension of the point, got shape {tuple(shape)}"
+        )
+
+
+def _point(x: Any) -> jax.Array:
+    x = jnp.asarray(x)
+    if x.ndim != 1:
+        raise ValueError(f"x must be one point of shape (D,), got shape {x.shape}")
+    return x
+
+
+def _array_valued(function: Any) -> Callable[[Any], Any]:
+    if not callable(function):
+        raise ValueError(
+            f"an operator takes a field or a function of the point, got {type(function).__name__}; "
+            "write js.grad(u)(x), not js.grad(u(x))"
+        )
+
+    def value(y: Any) -> Any:
+        out = function(y)
+        if isinstance(out, Field | LocalField):
+            raise ValueError("the function returned a field instead of its value: evaluate it, as in js.grad(u)(y)")
+        return jnp.stack(out) if isinstance(out, list | tuple) else jnp.asarray(out)
+
+    return value
+
+
+def _along(function: Callable[[Any], Any], axis: int) -> Callable[[Any], Any]:
+    """The derivative of a function of the point along one axis, by forward mode."""
+
+    def slope(y: Any) -> Any:
+        direction = np.zeros(len(y), y.dtype)
+        direction[axis] = 1
+        return jax.jvp(function, (y,), (direction,))[1]
+
+    return slope

@@ -1,0 +1,286 @@
+"""A boundary-value problem: a residual written as a Python function, and boundary conditions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from jsmitsm.equation.tracing import Traced
+
+
+@jax.tree_util.register_pytree_node_class
+class Condition:
+    """A boundary condition; made by :func:`dirichlet`, :func:`neumann`, :func:`robin`,
+    :func:`condition`, :func:`periodic`, :func:`fix` or :func:`free`.
+
+    Numbers and arrays in it are leaves of the pytree, functions are static.
+    """
+
+    def __init__(self, kind: str, field: int | None = None, **parts: Any):
+        self.kind = kind
+        self.field = field
+        self.parts = parts
+        self.numbers = tuple(k for k, v in parts.items() if not callable(v) and not isinstance(v, (str, tuple)))
+
+    def __getattr__(self, name: str) -> Any:
+        try:
+            return self.__dict__["parts"][name]
+        except KeyError:
+            raise AttributeError(name) from None
+
+    def tree_flatten(self):
+        static = tuple((k, v) for k, v in self.parts.items() if k not in self.numbers)
+        return tuple(self.parts[k] for k in self.numbers), (self.kind, self.field, self.numbers, static)
+
+    @classmethod
+    def tree_unflatten(cls, aux, leaves):
+        kind, field, names, static = aux
+        new = cls(kind, field, **dict(zip(names, leaves)), **dict(static))
+        new.numbers = names  # leaves stay leaves, whatever a tool puts in their place
+        return new
+
+    def __repr__(self) -> str:
+        def short(v: Any) -> str:
+            if isinstance(v, tuple) and len(v) > 6:
+                return f"({v[0]}, {v[1]}, ... {len(v)} in all)"
+            if callable(v) or isinstance(v, Traced):
+                return "<function>"
+            return f"array{v.shape}" if np.ndim(v) and hasattr(v, "shape") else str(v)
+
+        shown = [f"{k}={short(v)}" for k, v in self.parts.items()]
+        return f"{self.kind}({', '.join(shown + ([f'field={self.field}'] if self.field is not None else []))})"
+
+
+def dirichlet(value: Any, field: int | None = None) -> Condition:
+    """u = value on a group.
+
+    value : a scalar, an array over the group (n,), or a function of x (and of params, where the
+        problem has them). For a system without ``field``: a scalar for all fields, (F,), (n, F),
+        or a function returning (F,).
+    field : the field it holds for; all of them if not given.
+
+    Raises ValueError for what is no number, array or function, and for NaN.
+
+    >>> import jsmitsm as js
+    >>> js.dirichlet(1.0)
+    dirichlet(value=1.0)
+    """
+    return Condition("dirichlet", _field(field), value=_value(value, "value"))
+
+
+def neumann(value: Any, field: int | None = None) -> Condition:
+    """n . grad u = value on a group; ``value`` and ``field`` as in :func:`dirichlet`.
+
+    >>> import jsmitsm as js
+    >>> js.neumann(lambda x: x[0])
+    neumann(value=<function>)
+    """
+    return Condition("neumann", _field(field), value=_value(value, "value"))
+
+
+def robin(a: Any, b: Any, value: Any, field: int | None = None) -> Condition:
+    """a u + b n . grad u = value on a group; each of the three, and ``field``, as in :func:`dirichlet`.
+
+    Raises ValueError where ``a`` and ``b`` are both zero.
+
+    >>> import jsmitsm as js
+    >>> js.robin(1.0, 2.0, 0.0)
+    robin(a=1.0, b=2.0, value=0.0)
+    """
+    a, b = _value(a, "a"), _value(b, "b")
+    known = not any(callable(v) or isinstance(v, jax.core.Tracer) for v in (a, b))
+    if known and np.any((np.asarray(a) == 0) & (np.asarray(b) == 0)):
+        raise ValueError("robin: a and b are both zero, which states nothing of u; give one of them, or js.free()")
+    return Condition("robin", _field(field), a=a, b=b, value=_value(value, "value"))
+
+
+def condition(residual: Callable[..., Any]) -> Condition:
+    """A general condition, ``residual(u, x, n) = 0`` (and ``params`` last, where given).
+
+    ``residual`` returns a scalar, or a vector where it states several conditions at once; ``n``
+    is the unit outward normal. Raises ValueError for what is no function.
+
+    >>> import jsmitsm as js
+    >>> js.condition(lambda u, x, n: n @ js.grad(u)(x) + u(x) ** 4)
+    condition(residual=<function>)
+    """
+    if not callable(residual):
+        raise ValueError(f"residual: expected a function residual(u, x, n), got {type(residual).__name__}")
+    return Condition("condition", residual=residual)
+
+
+def periodic(first: str, second: str) -> Condition:
+    """The groups ``first`` and ``second`` are images of each other under a translation.
+
+    Give it under the key of either group; the particles of ``second`` take the values of ``first``.
+    Raises ValueError unless two different names are given.
+
+    >>> import jsmitsm as js
+    >>> js.periodic("left", "right")
+    periodic(groups=('left', 'right'))
+    """
+    if not (isinstance(first, str) and isinstance(second, str)) or first == second:
+        raise ValueError(f"periodic: expected the names of two different groups, got {first!r} and {second!r}")
+    return Condition("periodic", groups=(first, second))
+
+
+def fix(indices: Any, value: Any, field: int | None = None) -> Condition:
+    """Hold the particles ``indices`` (interior ones too) at ``value``; give it under any free key.
+
+    ``value`` and ``field`` as in :func:`dirichlet`. Raises ValueError for numbers that are none, or given twice.
+
+    >>> import jsmitsm as js
+    >>> js.fix([12], 0.0)
+    fix(indices=(12,), value=0.0)
+    """
+    index = np.atleast_1d(np.asarray(indices))
+    if index.ndim != 1 or index.dtype.kind not in "iu" or not index.size:
+        raise ValueError(f"indices: expected particle numbers, got {indices!r}")
+    if index.min() < 0 or len(np.unique(index)) != len(index):
+        raise ValueError(f"indices: particles are numbered from 0 and given once each, got {index.tolist()}")
+    return Condition("fix", _field(field), indices=tuple(int(i) for i in index), value=_value(value, "value"))
+
+
+def free() -> Condition:
+    """No condition on a group: the equation alone holds there (outflow, final time).
+
+    >>> import jsmitsm as js
+    >>> js.free()
+    free()
+    """
+    return Condition("free")
+
+
+def _field(field: Any) -> int | None:
+    if field is not None and (isinstance(field, bool) or not isinstance(field, (int, np.integer)) or field < 0):
+        raise ValueError(f"field: expected the number of a field (0, 1, ...), got {field!r}")
+    return None if field is None else int(field)
+
+
+def _value(value: Any, name: str) -> Any:
+    """A number, array or function; anything else is refused here, where the user wrote it."""
+    if callable(value) or isinstance(value, jax.core.Tracer):
+        return value
+    try:
+        array = np.asarray(value)
+        if array.dtype.kind not in "fiu":
+            raise TypeError
+    except (TypeError, ValueError):
+        raise ValueError(
+            f"{name}: expected a number, an array over the group or a function of x, got {value!r}"
+        ) from None
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name}: NaN or infinite numbers; give finite boundary data")
+    return value if isinstance(value, jax.Array) or array.ndim == 0 else array
+
+
+@jax.tree_util.register_pytree_node_class
+class Problem:
+    """A boundary-value problem.
+
+    A problem is a pytree: params and the numbers in the conditions are leaves.
+
+    Parameters
+    ----------
+    pde : function ``(u, x)`` or ``(u, x, params)`` returning the residual at the point x (D,):
+        a scalar, or (F,) for a system. ``u`` is a local field, see :mod:`jsmitsm.equation.operators`.
+    bcs : maps each boundary group to a condition, or to a list of them where the operator's
+        order or the number of fields needs several.
+    fields : number F of unknown fields.
+    params : any pytree of numbers. Where it is given, every function of the problem takes it as
+        its last argument, and new numbers in it never recompile.
+
+    Raises
+    ------
+    ValueError
+        For a pde that is no function, conditions that are none or of fields that do not exist, and
+        params that are not finite numbers.
+
+    Examples
+    --------
+    >>> import jsmitsm as js
+    >>> js.Problem(lambda u, x: js.laplacian(u)(x) - 1.0, {"left": js.dirichlet(0.0), "right": js.neumann(0.0)})
+    Problem(fields=1, left: dirichlet(value=0.0), right: neumann(value=0.0))
+    """
+
+    def __init__(
+        self,
+        pde: Callable[..., Any],
+        bcs: Mapping[str, Condition | Sequence[Condition]],
+        fields: int = 1,
+        params: Any = None,
+    ):
+        if not callable(pde):
+            raise ValueError(f"pde: expected a function pde(u, x) returning the residual, got {type(pde).__name__}")
+        if isinstance(fields, bool) or not isinstance(fields, (int, np.integer)) or fields < 1:
+            raise ValueError(f"fields: expected the number of unknown fields (1, 2, ...), got {fields!r}")
+        if not isinstance(bcs, Mapping):
+            raise ValueError(
+                f"bcs: expected a dict from group name to condition, got {type(bcs).__name__}; "
+                'write e.g. {"left": js.dirichlet(0.0)}'
+            )
+        _check_params(params)
+        self.pde = pde
+        self.fields = int(fields)
+        self.params = params
+        self.bcs = {name: _listed(name, value, self.fields) for name, value in bcs.items()}
+
+    def replace(self, **changes: Any) -> Problem:
+        """The same problem with other ``changes``: ``params``, ``pde``, ``bcs`` or ``fields``; ValueError for more."""
+        unknown = sorted(set(changes) - {"pde", "bcs", "fields", "params"})
+        if unknown:
+            raise ValueError(f"{unknown[0]}: no part of a Problem; it has pde, bcs, fields and params")
+        parts = {"pde": self.pde, "bcs": self.bcs, "fields": self.fields, "params": self.params}
+        return Problem(**{**parts, **changes})
+
+    def tree_flatten(self):
+        if isinstance(self.pde, Traced):
+            return (self.bcs, self.params, self.pde), (None, self.fields)
+        return (self.bcs, self.params), (self.pde, self.fields)
+
+    @classmethod
+    def tree_unflatten(cls, aux, leaves):
+        new = object.__new__(cls)
+        new.pde, new.fields = aux
+        new.bcs, new.params, *recorded = leaves
+        if recorded:
+            (new.pde,) = recorded
+        return new
+
+    def __repr__(self) -> str:
+        shown = ", ".join(f"{name}: {', '.join(map(repr, value))}" for name, value in self.bcs.items())
+        return f"Problem(fields={self.fields}, {shown})"
+
+
+def _check_params(params: Any) -> None:
+    """Parameters are finite numbers; traced ones pass."""
+    for path, leaf in jax.tree_util.tree_leaves_with_path(params):
+        if isinstance(leaf, jax.core.Tracer):
+            continue
+        where = f"params{jax.tree_util.keystr(path)}"
+        if getattr(leaf, "dtype", np.asarray(leaf).dtype if np.isscalar(leaf) else np.dtype(object)).kind not in "biuf":
+            raise ValueError(
+                f"{where}: expected a real number or array, got {leaf!r}; let the pde close over it instead"
+            )
+        if not np.isfinite(np.asarray(leaf)).all():
+            raise ValueError(f"{where}: NaN or infinite numbers; give finite ones")
+
+
+def _listed(name: Any, value: Any, fields: int) -> list[Condition]:
+    """The conditions of one group as a list."""
+    if not isinstance(name, str):
+        raise ValueError(f"bcs: the key {name!r} is no string; use the name of a boundary group")
+    given = list(value) if isinstance(value, (list, tuple)) else [value]
+    for c in given:
+        if not isinstance(c, Condition):
+            raise ValueError(
+                f"bcs[{name!r}]: expected a condition, got {c!r}; write js.dirichlet({c!r}), js.neumann(...) or such"
+            )
+        if c.field is not None and c.field >= fields:
+            raise ValueError(f"bcs[{name!r}]: field={c.field}, but the problem has fields 0 to {fields - 1}")
+    if not given:
+        raise ValueError(f"bcs[{name!r}]: no condition; give one, e.g. js.dirichlet(0.0)")
+    return given

@@ -1,0 +1,223 @@
+"""The differential transform of a PDE: its Taylor coefficients as linear constraints.
+
+For a linear operator ``sum_b a_b(x) d^b u = f(x)`` every Taylor coefficient of the residual
+about a particle vanishes up to degree p - m (Karamanli 2015, eqs. 32, 37, 40):
+
+    sum_b sum_{t<=c} A_b(t) (c-t+b)!/(c-t)! U(c-t+b) = F(c),      |c| <= p - m
+
+with A_b, F the coefficients of a_b and f and U(a) = d^a u / a!. In coordinates scaled by a
+length l, the unknowns are l^|a| U(a), and the row c carries the factor l^(m+|c|), so that all
+entries are free of units. The solutions of these constraints are
+
+    U = Q F + Z c
+
+with Z a basis of the homogeneous local solutions and c the free coefficients.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jsmitsm.particle.small_systems import general_inverse
+from jsmitsm.runtime.whole_program import in_one_program
+from jsmitsm.taylor.multi_indices import Slot, factorial, index_of, multi_indices
+
+
+@dataclass(frozen=True)
+class Recursion:
+    """The static structure of the constraints; built once per problem and order.
+
+    Attributes
+    ----------
+    levels : per equation, the power of length that makes its leading terms free of units.
+    weights : per field, the power of length that balances it against the others
+        (a pressure counts one derivative less than a velocity).
+    degrees : per equation, the highest degree of residual coefficients that is set to zero.
+    """
+
+    dim: int
+    order: int
+    fields: int
+    slots: tuple[Slot, ...]
+    levels: tuple[int, ...]
+    weights: tuple[int, ...]
+    degrees: tuple[int, ...]
+    pattern: tuple[tuple[bool, ...], ...]
+
+    @property
+    def size(self) -> int:
+        """Taylor coefficients of one field, K."""
+        return len(multi_indices(self.dim, self.order))
+
+    @property
+    def degree(self) -> int:
+        """The highest degree to which Taylor coefficients of the operator are needed."""
+        return max(self.degrees)
+
+    @property
+    def n_rows(self) -> int:
+        return len(_rows(self))
+
+    @property
+    def row_index(self) -> list[tuple[int, tuple[int, ...]]]:
+        """The equation and the multi-index of the residual's coefficient behind each row."""
+        return _rows(self)
+
+    @property
+    def scale_free(self) -> bool:
+        """Whether constant coefficients give the same constraints at every length scale."""
+        return all(
+            self.levels[e] == sum(b) + self.weights[f]
+            for e in range(len(self.levels))
+            for s, (f, b) in enumerate(self.slots)
+            if self.pattern[e][s]
+        )
+
+    @property
+    def equation_rows(self) -> tuple[int, ...]:
+        """The row of each equation's residual itself (c = 0)."""
+        return tuple(k for k, (_, c) in enumerate(_rows(self)) if sum(c) == 0)
+
+
+def recursion(
+    dim: int, order: int, fields: int, slots: Sequence[Slot], pattern: np.ndarray, orders: Sequence[int]
+) -> Recursion:
+    """Lay out the constraints of a traced operator for Taylor expansions of degree ``order``."""
+    weights = [0] * fields
+    for f in range(fields):
+        gaps = [
+            orders[e] - max(sum(b) for s, (g, b) in enumerate(slots) if g == f and pattern[e, s])
+            for e in range(len(orders))
+            if any(g == f and pattern[e, s] for s, (g, _) in enumerate(slots))
+        ]
+        weights[f] = min(gaps, default=0)
+    levels = [max(sum(b) + weights[f] for s, (f, b) in enumerate(slots) if pattern[e, s]) for e in range(len(orders))]
+    return Recursion(
+        dim, order, fields, tuple(slots), tuple(levels), tuple(weights),
+        tuple(order - m for m in orders), tuple(tuple(bool(v) for v in row) for row in pattern),
+    )  # fmt: skip
+
+
+@lru_cache(maxsize=64)
+def _rows(rec: Recursion) -> list[tuple[int, tuple[int, ...]]]:
+    """The constraint rows (equation, multi-index c)."""
+    return [(e, c) for e, q in enumerate(rec.degrees) for c in multi_indices(rec.dim, q)]
+
+
+@lru_cache(maxsize=64)
+def _entries(rec: Recursion) -> dict[str, np.ndarray]:
+    """Every term of the constraints: its place in C, its coefficient, factor and power of length."""
+    place, taylor = index_of(rec.dim, rec.order), index_of(rec.dim, rec.degree)
+    found = []
+    for row, (e, c) in enumerate(_rows(rec)):
+        for s, (f, b) in enumerate(rec.slots):
+            if not rec.pattern[e][s]:
+                continue
+            for t, t_index in taylor.items():
+                rest = tuple(ci - ti for ci, ti in zip(c, t))
+                if min(rest) < 0:
+                    continue
+                a = tuple(r + bi for r, bi in zip(rest, b))
+                power = rec.levels[e] - sum(b) - rec.weights[f] + sum(t)
+                found.append((row, f * rec.size + place[a], e, s, t_index, factorial(a) / factorial(rest), power))
+    names = ("row", "col", "equation", "slot", "taylor", "factor", "power")
+    return {name: np.array(values) for name, values in zip(names, zip(*found))}
+
+
+def row_lifts(rec: Recursion, length: Any, xp: Any = jnp) -> Any:
+    """The powers of length that make each constraint free of units: (rows,).
+
+    Integer powers are products: many times cheaper than a general power.
+    """
+    levels, place = np.unique([rec.levels[e] + sum(c) for e, c in _rows(rec)], return_inverse=True)
+    return xp.stack([length ** int(k) for k in levels])[place]
+
+
+def constraints(rec: Recursion, jac: Any, length: Any, xp: Any = jnp) -> tuple[Any, Any]:
+    """The constraint matrix of one particle and the factors of its right-hand side.
+
+    jac (E, S, T): Taylor coefficients of the operator's coefficients (T = 1 if constant);
+    length: scalar scale. Returns C (rows, F K) with rows of unit length, and the factors (rows,)
+    that turn the Taylor coefficients of the source into the right-hand side.
+    """
+    entries = _entries(rec)
+    constant = jac.shape[-1] == 1
+    keep = entries["taylor"] == 0 if constant else slice(None)
+    row, col, e, s, t, factor, power = (entries[k][keep] for k in entries)
+    powers = length ** xp.arange(int(power.max()) + 1)
+    values = jac[e, s, t] * factor * powers[power]
+    shape = (rec.n_rows, rec.fields * rec.size)
+    matrix: Any
+    if xp is np:
+        matrix = np.zeros(shape)
+        np.add.at(matrix, (row, col), values)
+    else:
+        matrix = jnp.zeros(shape, values.dtype).at[row, col].add(values)
+    norm = xp.sqrt(xp.sum(matrix**2, axis=1))
+    norm = xp.where(norm > 0, norm, 1.0)
+    return matrix / norm[:, None], row_lifts(rec, length, xp) / norm
+
+
+def source_rows(rec: Recursion, residual: Any) -> Any:
+    """Pick the right-hand side's Taylor coefficients (rows, N) from a residual (E, T, N) at u = 0."""
+    taylor = index_of(rec.dim, rec.degree)
+    e = np.array([e for e, _ in _rows(rec)])
+    t = np.array([taylor[c] for _, c in _rows(rec)])
+    return _negative(residual, e, t)
+
+
+@in_one_program
+def _negative(residual: Any, e: np.ndarray, t: np.ndarray) -> Any:
+    return -residual[e, t]
+
+
+# ---------------------------------------------------------------- elimination
+
+
+def free_indices(rec: Recursion, jac0: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+    """The paper's choice of free and dependent Taylor coefficients (positions in 0..K-1).
+
+    The equation is solved for the pure highest derivative along one axis, the one with the
+    largest coefficient (the last of equals: y for Laplace), so the coefficients whose degree
+    along that axis reaches the operator's order depend on the others.
+
+    jac0 (S, N): the operator's coefficients at the particles; None where they are traced, then
+    the last axis that has such a derivative is taken.
+    """
+    m = rec.order - rec.degrees[0]
+    sizes = []
+    for axis in range(rec.dim):
+        pure = tuple(m if k == axis else 0 for k in range(rec.dim))
+        here = [s for s, (_, b) in enumerate(rec.slots) if b == pure and rec.pattern[0][s]]
+        sizes.append(0.0 if not here else 1.0 if jac0 is None else np.abs(jac0[here[0]]).min())
+    if m > 0 and max(sizes) <= 1e-8 * (1.0 if jac0 is None else np.abs(jac0).max()):
+        raise ValueError(
+            "method: I, II and III solve the equation for a pure highest derivative along an axis, and every such "
+            'derivative is missing or its coefficient vanishes at a particle; use method="S", which needs none'
+        )
+    axis = rec.dim - 1 - int(np.argmax(np.array(sizes[::-1]) >= 0.999 * max(sizes)))
+    along = np.array([a[axis] for a in multi_indices(rec.dim, rec.order)])
+    return np.flatnonzero(along < m), np.flatnonzero(along >= m)
+
+
+@partial(jax.jit, static_argnums=(1, 2))
+def _substitute(matrix: Any, free: tuple[int, ...], dependent: tuple[int, ...]) -> tuple[Any, Any]:
+    k = matrix.shape[1]
+    inverse = general_inverse(matrix[:, np.array(dependent)])
+    z = jnp.zeros((k, len(free)), matrix.dtype).at[np.array(free), np.arange(len(free))].set(1.0)
+    z = z.at[np.array(dependent)].set(-inverse @ matrix[:, np.array(free)])
+    return z, jnp.zeros((k, matrix.shape[0]), matrix.dtype).at[np.array(dependent)].set(inverse)
+
+
+def substitution(matrix: Any, free: np.ndarray, dependent: np.ndarray) -> tuple[Any, Any]:
+    """Z and Q with the free coefficients themselves as coordinates (the paper's eqs. 38, 41)."""
+    if len(dependent) == 0:
+        return jnp.eye(matrix.shape[1], dtype=matrix.dtype), jnp.zeros((matrix.shape[1], 0), matrix.dtype)
+    return _substitute(matrix, tuple(int(i) for i in free), tuple(int(i) for i in dependent))

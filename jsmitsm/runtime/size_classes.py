@@ -1,0 +1,24 @@
+"""Size classes: arrays are padded to a few lengths, so that one compiled program serves clouds of similar size."""
+
+from __future__ import annotations
+
+# Particles per block: larger blocks leave the cache and are several times slower; in one of a power of two, rows of
+# the small matrices fall on the same lines of the cache.
+BLOCK = 40
+# So few particles are always padded to as many.
+FEW, _VERY_FEW, _LEAST = 2 * BLOCK, 16, 64
+
+
+def padded_size(n: int, steps: int = 8) -> int:
+    """The size class of n particles: shapes repeat between clouds of similar size, so that a compiled program serves
+    the next cloud too. ``steps`` (a power of two) of them to every doubling: at most one part in as many is wasted."""
+    if n <= FEW:
+        return FEW if n > _VERY_FEW else _VERY_FEW
+    blocks = -(-n // BLOCK)
+    step = max(1, (1 << (blocks - 1).bit_length()) // (2 * steps))
+    return -(-blocks // step) * step * BLOCK
+
+
+def cloud_size(n: int) -> int:
+    """The size class of a cloud of n particles, which are only looked up: few programs serve all clouds."""
+    return max(_LEAST, 1 << (n - 1).bit_length())

@@ -1,0 +1,287 @@
+"""Programs that stay whole, and keep their compiler options, under an eager jax.grad, jvp or vmap.
+
+A jitted function that is differentiated does neither: JAX splits it into programs of its own, compiles each with full
+effort, and refuses options of a program that may come to stand in a larger one. So a program is a primitive here. With
+f its function of x, its transformations are programs again, compiled by the same options:
+
+    jvp         f(x)  and  moved: (x, dx) -> f'(x) dx
+    transpose   pulled: (known arguments, y_bar) -> x_bar, for an f that is linear in the arguments x
+    vmap        mapped: f along an axis
+
+Nothing but x is kept between them: what f computes on the way is computed again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextvars import ContextVar
+from functools import lru_cache, wraps
+from inspect import signature
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend.core import Literal, Primitive, jaxpr_as_fun
+from jax.interpreters import ad, batching, mlir
+
+from jsmitsm.runtime import one_kernel
+from jsmitsm.runtime.collector import uncollected
+from jsmitsm.runtime.tracers import is_traced, recorded
+
+# Options as pairs; None: f runs as it stands, in numpy, and its derivatives are compiled with little effort.
+Options = tuple[tuple[str, Any], ...] | None
+_LITTLE: Any = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 1}
+_KEPT = 1024
+
+
+_only_run: ContextVar[bool] = ContextVar("a program that is only run", default=False)
+
+
+def only_run() -> bool:
+    """Whether no derivative will be taken of what is traced here: how often a loop runs may be a number of its own.
+
+    Only the programs that run are traced so; ``part``, of which derivatives are made, is not.
+    """
+    return _only_run.get()
+
+
+def _to_be_run(function: Callable[..., Any]) -> Callable[..., Any]:
+    @wraps(function)
+    def run(*arguments: Any) -> Any:
+        before = _only_run.set(True)
+        try:
+            return function(*arguments)
+        finally:
+            _only_run.reset(before)
+
+    return run
+
+
+def called(
+    function: Callable[..., Any], static: dict[str, Any], arguments: dict[str, Any], options: Options,
+    small: bool = False,
+) -> Any:  # fmt: skip
+    """``function(**static, **arguments)`` as one program; not for calls inside of a larger one.
+
+    ``small``: its arrays are so small that one kernel should do it all.
+    """
+    leaves, tree = jax.tree.flatten(arguments)
+    program = _whole(function, tuple(static.items()), tree, options, small)
+    if not is_traced(leaves):
+        return program.run(*leaves)
+    return jax.tree.unflatten(program.result(_avals(leaves)).tree, program_p.bind(*leaves, program=program))
+
+
+def in_one_program(function: Callable[..., Any], static: tuple[str, ...] = ()) -> Callable[..., Any]:
+    """``function`` as it stands, for numbers; as a whole where an argument of it is traced.
+
+    Under an eager jax.grad or jax.vmap each operation is otherwise a program of its own, compiled for every
+    shape, and so is what differentiates it: a hundred of them take ten times as long as the local phase.
+    """
+    compiled, parameters = jax.jit(function, static_argnames=static), signature(function)
+
+    @wraps(function)
+    def run(*arguments: Any, **named: Any) -> Any:
+        if not is_traced(arguments, named):
+            return function(*arguments, **named)
+        if recorded():
+            return compiled(*arguments, **named)
+        given = parameters.bind(*arguments, **named).arguments
+        return called(function, {k: given.pop(k) for k in static}, dict(given), None)
+
+    return run
+
+
+picked = in_one_program(lambda values, index: values[index])
+
+
+class Program:
+    """A function of arrays; ``base``: not a derivative of another one."""
+
+    def __init__(
+        self, function: Callable[..., Any], name: str, options: Options, base: bool = False, small: bool = False
+    ):
+        self.name, self.options, self.on_host, self.small = name, options, base and options is None, small
+        self.function, self.trace = function, jax.jit(function).trace
+        self.results: dict[Any, Result] = {}
+
+        def part(*arguments: Any) -> Any:
+            """The function inside of other programs, traced once for all of them."""
+            result = self.result(_avals(arguments))
+            return jax.tree.unflatten(result.tree, jaxpr_as_fun(result.closed)(*arguments))
+
+        part.__name__ = name
+        if options is None:
+            options = tuple(_LITTLE.items()) if jax.default_backend() == "cpu" else ()
+        function.__name__ = name
+        if base:
+            function = _to_be_run(function)
+        self.part, self.compiled = part, jax.jit(function, compiler_options=dict(options))
+        if small:
+            self.kernel = jax.jit(one_kernel.one_kernel(function), compiler_options=dict(options) | one_kernel.OPTIONS)
+
+    def run(self, *arguments: Any) -> Any:
+        if self.on_host:
+            return self.function(*map(np.asarray, arguments))
+        with uncollected():
+            return self._run(*arguments)
+
+    def _run(self, *arguments: Any) -> Any:
+        config: Any = jax.config
+        if config.jax_disable_jit:  # step by step: what a compiled program makes of numpy's arrays by itself
+            return self.function(*map(jnp.asarray, arguments))
+        if not self.small:
+            return self.compiled(*arguments)
+        try:
+            return self.kernel(*arguments)[0]
+        except jax.errors.JaxRuntimeError as error:
+            if "UNIMPLEMENTED" not in str(error):
+                raise
+            self.small = False  # an operation that a kernel cannot hold
+            return self.compiled(*arguments)
+
+    def result(self, avals: tuple[Any, ...]) -> Result:
+        config: Any = jax.config
+        key = avals, config.jax_enable_x64  # a setting of the thread, and of the moment
+        found = self.results.get(key)
+        if found is None:
+            found = self.results[key] = Result(self.trace(*avals))
+        return found
+
+
+class Result:
+    """What is known of a program's results before it runs."""
+
+    def __init__(self, traced: Any):
+        leaves, self.tree = jax.tree.flatten(traced.out_info)
+        self.avals = [jax.core.ShapedArray(x.shape, x.dtype) for x in leaves]
+        self.closed = traced.jaxpr
+
+    def reached(self, active: Sequence[int]) -> tuple[int, ...]:
+        """Those that depend on the ``active`` arguments and are not whole numbers."""
+        jaxpr = self.closed.jaxpr
+        moving = {jaxpr.invars[k] for k in active}
+        for eqn in jaxpr.eqns:
+            if any(not isinstance(v, Literal) and v in moving for v in eqn.invars):
+                moving.update(eqn.outvars)
+        inexact = [jnp.issubdtype(x.dtype, jnp.inexact) for x in self.avals]
+        return tuple(k for k, v in enumerate(jaxpr.outvars)
+                     if inexact[k] and not isinstance(v, Literal) and v in moving)  # fmt: skip
+
+
+def _avals(values: Sequence[Any]) -> tuple[Any, ...]:
+    return tuple(jax.typeof(x) for x in values)
+
+
+def _with(values: Sequence[Any], places: Sequence[int], new: Sequence[Any]) -> list[Any]:
+    out = list(values)
+    for k, value in zip(places, new, strict=True):
+        out[k] = value
+    return out
+
+
+# ------------------------------------------------------------------------------------- the four kinds
+
+
+@lru_cache(maxsize=_KEPT)
+def _whole(
+    function: Callable[..., Any], static: tuple[tuple[str, Any], ...], tree: Any, options: Options, small: bool
+) -> Program:
+    """A function of the leaves of its arguments."""
+    call = lambda *leaves: function(**dict(static), **jax.tree.unflatten(tree, leaves))  # noqa: E731
+    return Program(call, function.__name__, options, base=True, small=small)
+
+
+@lru_cache(maxsize=_KEPT)
+def _moved(program: Program, active: tuple[int, ...], reached: tuple[int, ...]) -> Program:
+    """(x, tangents of the ``active`` arguments) -> tangents of the results ``reached``."""
+
+    def moved(*arguments: Any) -> Any:
+        split = len(arguments) - len(active)
+        x, slopes = arguments[:split], arguments[split:]
+
+        def some(*moving: Any) -> tuple[Any, ...]:
+            out = jax.tree.leaves(program.part(*_with(x, active, moving)))
+            return tuple(out[k] for k in reached)
+
+        return jax.jvp(some, tuple(x[k] for k in active), slopes)[1]
+
+    return Program(moved, f"moved_{program.name}", program.options)
+
+
+@lru_cache(maxsize=_KEPT)
+def _pulled(program: Program, linear: tuple[int, ...], avals: tuple[Any, ...], given: tuple[int, ...]) -> Program:
+    """(the other arguments, cotangents of the results ``given``) -> cotangents of the ``linear`` arguments."""
+
+    def pulled(*arguments: Any) -> Any:
+        split = len(arguments) - len(given)
+        known, cotangents = arguments[:split], arguments[split:]
+        count = split + len(linear)
+        full = _with([None] * count, [k for k in range(count) if k not in linear], known)
+
+        def some(*moving: Any) -> tuple[Any, ...]:
+            out = jax.tree.leaves(program.part(*_with(full, linear, moving)))
+            return tuple(out[k] for k in given)
+
+        return jax.linear_transpose(some, *avals)(cotangents)
+
+    return Program(pulled, f"pulled_{program.name}", program.options)
+
+
+@lru_cache(maxsize=_KEPT)
+def _mapped(program: Program, axes: tuple[int | None, ...]) -> Program:
+    return Program(jax.vmap(program.part, axes), f"mapped_{program.name}", program.options)
+
+
+# ------------------------------------------------------------------------------------- primitive
+
+program_p = Primitive("jsmitsm_program")
+program_p.multiple_results = True
+
+
+def _impl(*arguments: Any, program: Program) -> list[Any]:
+    out = jax.tree.leaves(program.run(*arguments))
+    if program.on_host:
+        avals = program.result(_avals(arguments)).avals
+        return [jnp.asarray(np.asarray(x, a.dtype)) for x, a in zip(out, avals, strict=True)]
+    return out
+
+
+def _jvp(primals: Any, tangents: Any, *, program: Program) -> Any:
+    out = program_p.bind(*primals, program=program)
+    active = tuple(k for k, t in enumerate(tangents) if type(t) is not ad.Zero)
+    result = program.result(_avals(primals))
+    slopes: list[Any] = [ad.Zero(x.to_tangent_aval()) for x in result.avals]
+    reached = result.reached(active)
+    if reached:
+        moved = program_p.bind(*primals, *(tangents[k] for k in active), program=_moved(program, active, reached))
+        slopes = _with(slopes, reached, moved)
+    return out, slopes
+
+
+def _transpose(cotangents: Any, *arguments: Any, program: Program) -> list[Any]:
+    linear = tuple(k for k, a in enumerate(arguments) if ad.is_undefined_primal(a))
+    given = tuple(k for k, ct in enumerate(cotangents) if type(ct) is not ad.Zero)
+    known = [a for k, a in enumerate(arguments) if k not in linear]
+    pulled = _pulled(program, linear, tuple(arguments[k].aval for k in linear), given)
+    found = program_p.bind(*known, *(cotangents[k] for k in given), program=pulled)
+    return _with([None] * len(arguments), linear, found)
+
+
+def _batch(arguments: Any, axes: Any, *, program: Program) -> Any:
+    out = program_p.bind(*arguments, program=_mapped(program, tuple(axes)))
+    return out, [0] * len(out)
+
+
+def _lower(ctx: Any, *arguments: Any, program: Program) -> Any:
+    """Inside of a larger program, where a derivative taken outside is called: a part of that."""
+    return mlir.lower_fun(lambda *x: jax.tree.leaves(program.part(*x)), True)(ctx, *arguments)
+
+
+program_p.def_impl(_impl)
+program_p.def_abstract_eval(lambda *avals, program: program.result(avals).avals)
+ad.primitive_jvps[program_p] = _jvp
+ad.primitive_transposes[program_p] = _transpose
+batching.primitive_batchers[program_p] = _batch
+mlir.register_lowering(program_p, _lower)

@@ -1,0 +1,4 @@
+"""Pictures and files.
+
+Imports solution and what stands before it.
+"""

@@ -1,0 +1,4 @@
+"""From a problem to an answer: solve, Newton, error estimate, flags, factorize.
+
+Imports everything before it.
+"""

@@ -1,0 +1,74 @@
+"""Arguments of a solve, judged before any work."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from jsmitsm.cloud.cloud import Cloud
+from jsmitsm.cloud.neighbours import Stencils
+from jsmitsm.discretization.layout import Discretization, discretize
+from jsmitsm.equation.problem import Problem
+from jsmitsm.linear.linsolve import SOLVERS
+from jsmitsm.particle.kernels import Kernel
+from jsmitsm.runtime.tracers import is_traced
+from jsmitsm.taylor.multi_indices import HIGHEST
+
+METHODS = ("I", "II", "III", "S", "SSPH")
+
+
+def discretized(
+    problem: Problem, cloud: Cloud, method: str = "S", order: int = 4, kernel: Kernel | None = None,
+    stencils: Stencils | None = None, basis_terms: int | None = None, formulation: str = "auto", solver: str = "auto",
+) -> Discretization:  # fmt: skip
+    """Checked arguments, discretised."""
+    check(problem, cloud, method, order, kernel, stencils, formulation, solver)
+    return discretize(problem, cloud, method, order, kernel, stencils, basis_terms)
+
+
+def check(
+    problem, cloud, method, order, kernel, stencils, formulation="auto", solver="auto", u0=None, throw=True
+) -> None:
+    """Arguments of :func:`solve` that can be judged before any work."""
+    for value, kind, name in ((problem, Problem, "problem"), (cloud, Cloud, "cloud")):
+        if not isinstance(value, kind):
+            raise ValueError(f"{name}: expected a js.{kind.__name__}, got {type(value).__name__}")
+    if kernel is not None and not isinstance(kernel, Kernel):
+        raise ValueError(
+            f"kernel: expected a kernel such as js.SuperGaussian(h, d), got {kernel!r}; wrap your own with js.Kernel"
+        )
+    if stencils is not None and not isinstance(stencils, Stencils):
+        raise ValueError(f"stencils: expected js.stencils(cloud, size=...), got {type(stencils).__name__}")
+    for value, known, name in (
+        (method, METHODS, "method"), (formulation, ("auto", "loo", "lsq"), "formulation"), (solver, SOLVERS, "solver")
+    ):  # fmt: skip
+        if value not in known:
+            raise ValueError(f"{name}: {value!r} is none of {', '.join(map(repr, known))}")
+    if formulation == "lsq" and method != "S":
+        raise ValueError(f'formulation: "lsq" is a form of method S, not of {method!r}; use method="S" or "loo"')
+    if stencils is not None and any(c.kind == "periodic" for cs in problem.bcs.values() for c in cs):
+        raise ValueError("stencils: those of a cloud do not reach periodic images; leave stencils out")
+    if not isinstance(throw, (bool, np.bool_)):
+        raise ValueError(f"throw: expected True or False, got {throw!r}")
+    _check_start(u0, (len(cloud), problem.fields))
+    if isinstance(order, bool) or not isinstance(order, (int, np.integer)) or not 1 <= order <= HIGHEST:
+        raise ValueError(
+            f"order: expected a whole number from 1 to {HIGHEST}, the degree of the expansions, got {order!r}"
+        )
+
+
+def _check_start(u0: Any, shape: tuple[int, int]) -> None:
+    """A start for Newton's method: nothing, a function, or finite values of the right shape."""
+    if u0 is None or callable(u0) or is_traced(u0):
+        return
+    try:
+        if np.iscomplexobj(u0):
+            raise TypeError
+        values = np.asarray(u0, float)
+    except (TypeError, ValueError):
+        raise ValueError(f"u0: expected a function of x or an array, got {u0!r}") from None
+    if values.shape not in (shape, shape[:1]):
+        raise ValueError(f"u0: expected a function, ({shape[0]},) or {shape}, got shape {values.shape}")
+    if not np.isfinite(values).all():
+        raise ValueError("u0: NaN or infinite values; start from finite ones")

@@ -1,0 +1,131 @@
+"""A problem prepared for many right-hand sides: what a new source or new boundary values leave valid is kept."""
+
+from __future__ import annotations
+
+from copy import copy
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from jsmitsm.cloud.cloud import Cloud
+from jsmitsm.cloud.neighbours import Stencils
+from jsmitsm.discretization.coefficients import Numbers, numbers
+from jsmitsm.discretization.layout import Discretization, discretize, table
+from jsmitsm.discretization.least_squares import least_squares_right_side
+from jsmitsm.discretization.leave_one_out import right_side, with_held
+from jsmitsm.equation.problem import Problem
+from jsmitsm.particle.kernels import Kernel
+from jsmitsm.runtime.progress import bar
+from jsmitsm.runtime.tracers import is_traced
+from jsmitsm.solution.arguments import check, discretized
+from jsmitsm.solution.fit import Fit, Recipe
+from jsmitsm.solution.run import Run
+from jsmitsm.solution.solution import Solution
+
+
+class Factorization:
+    """A problem ready to be solved again; made by :func:`factorize`, which has an example.
+
+    ``solve(problem)`` keeps the neighbours, the rows and the factors as long as only the source and
+    the values in the conditions changed, and makes anew what else did.
+    """
+
+    def __init__(self, disc: Discretization, problem: Problem, solver: str, repair: bool, formulation: str):
+        self._disc, self._options = disc, (solver, repair, formulation)
+        problem = disc.problem
+        self._run = Run(disc, problem, solver, True, repair, formulation)
+        self._nums = numbers(disc, problem)
+        self._parts: list[Any] = []  # of the least-squares form
+        data, rows, cols, self._right = self._run.assembled(self._nums, self._parts)
+        self._matrix = data, rows, cols
+        self._factor: Any = None  # kept as long as this is, whatever else is solved
+
+    @bar("solve")
+    def solve(self, problem: Problem) -> Solution:
+        """The solution of a problem with the same operator; source and boundary values may differ.
+
+        Raises ValueError for another kind of operator or conditions, SolveError as :func:`jsmitsm.solve` does.
+        """
+        old = self._disc
+        method, order, kernel = old.scheme.method, old.rec.order, old.kernel
+        check(problem, old.cloud, method, order, kernel, None)
+        disc = discretize(problem, old.cloud, method, order, kernel, Stencils(table(old), None), old.basis_terms)
+        if disc.scheme != old.scheme or not np.array_equal(disc.held, old.held):
+            raise ValueError(
+                "problem: its operator or the kind of its conditions differs from the one that was factorised; "
+                "call js.factorize again"
+            )
+        problem = disc.problem
+        nums = numbers(disc, problem)
+        same = _same(nums.jac, self._nums.jac) and _same(nums.own, self._nums.own) and _same(nums.data, self._nums.data)
+        if not same or disc.scheme.method in ("I", "II"):
+            made = Factorization(disc, problem, *self._options)
+            return made._finish(problem, made._nums, made._right)
+        return self._finish(problem, nums, self._right_side(nums))
+
+    def _right_side(self, nums: Numbers) -> Any:
+        if self._run.formulation == "lsq":
+            return least_squares_right_side(self._disc, nums, self._parts)
+        assert self._run.rows is not None
+        return right_side(self._disc, nums, *self._run.rows)
+
+    def _finish(self, problem: Problem, nums: Numbers, right: Any) -> Solution:
+        disc = self._disc
+        run = copy(self._run)  # the solution's own: what it says of itself must not change with the next
+        run.problem, run.messages, run.against = problem, list(run.messages), list(run.against)
+        x, good = run.solved(*self._matrix, right)
+        if self._factor is None and not is_traced(self._matrix, x):
+            self._factor = run.factor_of(*self._matrix)
+        values = with_held(disc, nums, x)
+        traced = is_traced(values)
+        if not traced:
+            run.nums, run.values = nums, np.asarray(values)
+        recipe = Recipe(disc.scheme.method, disc.rec.order, disc.basis_terms, run.formulation, problem.fields)
+        fit = Fit(problem, disc.cloud, disc.kernel, table(disc), None, recipe)
+        fine = jnp.isfinite(values).all() if traced else good
+        return Solution(values, disc.cloud, recipe, fit, fine, 1, run.stats(), report=None if traced else run)
+
+    def __reduce__(self):
+        raise TypeError(
+            "a Factorization is not pickled, nor copied: keep the problem and the cloud, and call js.factorize again"
+        )
+
+    def __repr__(self) -> str:
+        return f"Factorization({int((~self._disc.held).sum())} unknowns, method={self._disc.scheme.method!r})"
+
+
+def _same(x: Any, y: Any) -> bool:
+    return np.shape(x) == np.shape(y) and not is_traced(x, y) and bool(np.array_equal(np.asarray(x), np.asarray(y)))
+
+
+@bar("factorize")
+def factorize(
+    problem: Problem, cloud: Cloud, *, method: str = "S", order: int = 4, kernel: Kernel | None = None,
+    stencils: Stencils | None = None, basis_terms: int | None = None, formulation: str = "auto", solver: str = "auto",
+) -> Factorization:  # fmt: skip
+    """Prepare a linear problem for many right-hand sides.
+
+    Returns an object whose ``solve(problem)`` reuses everything that a change of the source or of
+    the values in the conditions leaves valid: neighbours, moment systems, ordering and factors.
+
+    ``method``, ``order``, ``kernel``, ``stencils``, ``basis_terms``, ``formulation`` and ``solver`` as for
+    :func:`jsmitsm.solve`.
+    Raises ValueError for a nonlinear problem: its matrix changes in every step.
+
+    Examples
+    --------
+    >>> import jax; jax.config.update("jax_enable_x64", True)
+    >>> import jsmitsm as js
+    >>> cloud = js.interval(0.0, 1.0, 11)
+    >>> def heated(q):
+    ...     ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(0.0)}
+    ...     return js.Problem(lambda u, x: js.laplacian(u)(x) + q, ends)
+    >>> ready = js.factorize(heated(1.0), cloud)
+    >>> round(float(ready.solve(heated(8.0)).u[5]), 10)
+    1.0
+    """
+    disc = discretized(problem, cloud, method, order, kernel, stencils, basis_terms, formulation, solver)
+    if not disc.linear:
+        raise ValueError("problem: it is nonlinear, so its matrix changes in every step; use js.solve")
+    return Factorization(disc, problem, solver, kernel is None and stencils is None, formulation)

@@ -1,0 +1,72 @@
+"""How a solution was made: enough to discretise its problem again, and to fit its local polynomials."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jsmitsm.cloud.neighbours import Stencils
+from jsmitsm.discretization.coefficients import numbers
+from jsmitsm.discretization.held_particles import held_particles
+from jsmitsm.discretization.layout import Discretization, discretize, sorted_classes
+from jsmitsm.discretization.rows import all_coefficients
+from jsmitsm.runtime.progress import bar
+from jsmitsm.runtime.tracers import is_traced
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How a solution was made, static: enough to fit its local polynomials again."""
+
+    method: str
+    order: int
+    basis_terms: int | None
+    formulation: str
+    fields: int
+
+
+@jax.tree_util.register_pytree_node_class
+class Fit:
+    """What it takes to fit the local polynomials of a solution again.
+
+    taylor : (N, F, K) the expansions about which a nonlinear problem was last linearised, or None.
+    """
+
+    def __init__(self, problem, cloud, kernel, neighbours, taylor, recipe):
+        self.problem, self.cloud, self.kernel = problem, cloud, kernel
+        self.neighbours, self.taylor = neighbours, taylor
+        self.recipe = recipe
+
+    def discretization(self) -> Discretization:
+        near = Stencils(self.neighbours, None)
+        r = self.recipe
+        return discretize(self.problem, self.cloud, r.method, r.order, self.kernel, near, r.basis_terms)
+
+    @bar("fitting")
+    def coefficients(self, values: Any) -> Any:
+        """Taylor coefficients (N, F, K) of every particle."""
+        disc, taylor = self.discretization(), self.taylor
+        held = held_particles(disc)
+        if taylor is not None and len(held):
+            # Those of held particles are continued from others; fitted where that is linearised they are their own.
+            fitted = self._fitted(disc, held, taylor, values)
+            alone = np.isin(disc.partner, held)[:, None, None]
+            taylor = (jnp if is_traced(fitted, taylor) else np).where(alone, fitted, taylor)
+        return self._fitted(disc, np.flatnonzero(disc.partner == np.arange(len(self.cloud))), taylor, values)
+
+    def _fitted(self, disc: Discretization, ids: np.ndarray, taylor: Any, values: Any) -> Any:
+        """Taylor coefficients (N, F, K) of the particles ``ids`` alone, linearised at ``taylor``."""
+        disc.classes = sorted_classes(disc, ids, disc.stencils)
+        nums = numbers(disc, self.problem, taylor, everywhere=True)
+        return all_coefficients(disc, nums, values)
+
+    def tree_flatten(self):
+        return (self.problem, self.cloud, self.kernel, self.neighbours, self.taylor), self.recipe
+
+    @classmethod
+    def tree_unflatten(cls, recipe, leaves):
+        return cls(*leaves, recipe)

@@ -1,0 +1,279 @@
+"""One linear solve from rows to values: repair, global system, solve, and checks by name."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from functools import cached_property
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from jsmitsm.discretization import health
+from jsmitsm.discretization.coefficients import Numbers, numbers
+from jsmitsm.discretization.layout import Class, Discretization, discretize
+from jsmitsm.discretization.least_squares import least_squares, misfit
+from jsmitsm.discretization.leave_one_out import matrix, right_side, with_held
+from jsmitsm.discretization.operator_kind import prefers_least_squares
+from jsmitsm.discretization.rows import all_rows
+from jsmitsm.equation.problem import Problem
+from jsmitsm.linear import linsolve
+from jsmitsm.particle.moments import Row
+from jsmitsm.runtime.errors import SolveError, some
+from jsmitsm.runtime.tracers import is_traced
+from jsmitsm.solution.balance import imbalance, unbalanced
+from jsmitsm.solution.flags import flags
+from jsmitsm.solution.memory import refuse_too_large
+from jsmitsm.solution.statistics import skipped
+
+
+class Run:
+    """One call of ``solve``: the discretisation, its options, and what happened."""
+
+    def __init__(
+        self, disc: Discretization, problem: Problem, solver: str, throw: bool, repair: bool, formulation: str
+    ):
+        self.disc, self.problem = disc, problem
+        self.solver, self.throw, self.repair = solver, throw, repair
+        self.formulation = formulation
+        self.seconds: dict[str, float] = {"local": 0.0, "assembly": 0.0, "solve": 0.0}
+        self.messages: list[str] = []
+        self.against: list[str] = []  # those of the messages that speak against the solution
+        self.failed = False
+        self.linear: dict[str, Any] = {}
+        self.health: health.Health | None = None
+        self.imbalance = np.inf  # of a floating field's data, once solved: the mean residual relative to them
+        refuse_too_large(self.disc, self.formulation, self.solver)
+        # What the last step leaves for the flags; nothing of it under a JAX transform.
+        self.rows: tuple[list[Class], list[Row]] | None = None
+        self.nums: Numbers | None = None
+        self.values: np.ndarray | None = None
+
+    def local_rows(self, nums: Numbers) -> tuple[list[Class], list[Row]]:
+        """The rows of all classes, weak stencils repaired the first time."""
+        disc = self.disc
+        classes, rows = all_rows(disc, nums)
+        if is_traced(rows):
+            return classes, rows
+        if self.repair and self.health is None and disc.scheme.method in ("S", "III"):
+            classes, rows, self.health = health.repaired(disc, nums, classes, rows)
+            disc.classes = classes
+        else:
+            before = self.health
+            self.health = health.examine(classes, rows)
+            if before is not None:  # Newton's later steps keep the stencils of the first
+                self.health.repaired = before.repaired
+        if self.repair:
+            self._tell_repairs()
+        bad = self.health.undetermined
+        if len(bad) and not np.isfinite(np.asarray(nums.jac)).all():
+            self.fail(
+                f"the equation or its derivative by u is not finite at {len(bad)} particle(s), first {some(bad)}: "
+                "start nearer to the solution (u0), inside the range for which the pde is defined",
+                bad,
+            )
+        elif len(bad):
+            single = any(np.asarray(row.weights).dtype == np.float32 for row in rows)
+            self.fail(
+                f"the moment systems of {len(bad)} particle(s) do not determine the solution, first {some(bad)}: too "
+                "few neighbours, or neighbours in a special position; "
+                + ('enable float64 with jax.config.update("jax_enable_x64", True), ' if single else "")
+                + "widen the support (h, d or stencils), lower the order, or move the particles",
+                bad,
+            )
+        return classes, rows
+
+    def _tell_repairs(self) -> None:
+        found = self.health
+        if found is not None and len(found.repaired):
+            self.messages.append(
+                f"{len(found.repaired)} weak stencil(s) were widened or balanced, first {some(found.repaired)}."
+            )
+        if found is not None and len(found.weak):
+            self.messages.append(
+                f"{len(found.weak)} particle(s) stay weak (Lebesgue constant above {health.LEBESGUE}, at most "
+                f"{found.largest:.3g}), first {some(found.weak)}: the cloud is too coarse or one-sided there."
+            )
+
+    def fail(self, message: str, particles: Any = ()) -> None:
+        """Raise, or note the failure where the caller asked for that."""
+        if self.throw:
+            raise SolveError(message, [int(i) for i in np.asarray(particles)[:100]])
+        self.failed = True
+        self._object(f"FAILED: {message}.")
+
+    def _object(self, message: str) -> None:
+        self.messages.append(message)
+        self.against.append(message)
+
+    def _forget(self) -> None:
+        """What an earlier step said speaks of other rows."""
+        self.messages, self.against, self.failed = [], [], False
+
+    def step(self, nums: Numbers) -> tuple[Any, Any]:
+        """Assemble and solve one linear system: values (N, F), and whether it went well."""
+        data, r, c, b = self.assembled(nums)
+        start = time.perf_counter()
+        x, good = self.solved(data, r, c, b)
+        values = with_held(self.disc, nums, x)
+        self.seconds["solve"] += time.perf_counter() - start
+        if is_traced(values):
+            return values, jnp.isfinite(values).all()
+        self.nums, self.values = nums, values
+        return values, bool(good and np.isfinite(values).all() and not self.failed)
+
+    def assembled(self, nums: Numbers, parts: list[Any] | None = None) -> tuple[Any, Any, Any, Any]:
+        """The global system: entries of the matrix, their rows and columns, and the right-hand side.
+
+        parts: see :func:`jsmitsm.discretization.least_squares.least_squares`.
+        """
+        clock, disc = time.perf_counter, self.disc
+        start = clock()
+        self._forget()
+        if disc.cut_off:
+            self.messages.append(
+                f"The supports of at least {len(disc.cut_off)} particle(s), first {some(disc.cut_off)}, reach outside "
+                "of the given stencils, which cut them off: build wider stencils, or take a smaller h or d."
+            )
+        if self.formulation == "auto":
+            self.formulation = "lsq" if prefers_least_squares(disc, nums) else "loo"
+            refuse_too_large(self.disc, self.formulation, self.solver)
+        if self.formulation == "lsq":
+            made = least_squares(disc, nums, parts)
+            local = clock()
+        else:
+            self.rows = classes, rows = self.local_rows(nums)
+            local = clock()
+            made = *matrix(disc, classes, rows), right_side(disc, nums, classes, rows)
+        self.seconds["local"] += local - start
+        self.seconds["assembly"] += clock() - local
+        return made
+
+    def solved(self, data: Any, r: Any, c: Any, b: Any, balanced: bool = True) -> tuple[Any, bool]:
+        """Solve the global system; floating fields get a zero mean by a Lagrange multiplier.
+
+        balanced: the right-hand side is that of a problem, which must balance where a field floats.
+        """
+        disc = self.disc
+        free = np.flatnonzero(~disc.held.reshape(-1))
+        n, fields = len(free), disc.rec.fields
+        data, r, c, b, points = self._bordered(data, r, c, b)
+        try:
+            x: Any = linsolve.solve(
+                data, r, c, b, n=len(b), points=points, solver=self.solver, elliptic=self._elliptic, info=self.linear
+            )
+        except linsolve.SingularMatrix as error:
+            at = np.array([u for u in error.unknowns if u < n], int)
+            particles = free[at] // fields
+            self.fail(
+                f"{error.args[0].rstrip('.')}: particles {some(particles)}; is a condition missing, a part of the "
+                "cloud not connected, or the operator at a resonance?",
+                particles,
+            )
+            return np.full(n, np.nan), False
+        if not is_traced(x):
+            x = np.asarray(x)
+            if disc.floating:
+                system = linsolve.factor(data, r, c, len(b), points, self.solver, self._elliptic)
+                self.imbalance = imbalance(system, x, b, n)
+                if balanced:
+                    self._check_balance()
+        return x[:n], True
+
+    @property
+    def _elliptic(self) -> bool:
+        """Whether multigrid may be expected to work."""
+        return self.disc.rec.fields == 1 and not self.disc.floating
+
+    def _bordered(self, data: Any, r: Any, c: Any, b: Any) -> tuple[Any, Any, Any, Any, Any]:
+        """The system and the places of its unknowns; a row and a column of ones more for every floating field."""
+        disc, fields = self.disc, self.disc.rec.fields
+        free = np.flatnonzero(~disc.held.reshape(-1))
+        points = None if is_traced(disc.cloud.points) else np.asarray(disc.cloud.points)[free // fields]
+        xp = jnp if is_traced(data, b) else np
+        for k, f in enumerate(disc.floating):
+            ids = np.flatnonzero(free % fields == f)
+            line = np.full(len(ids), len(free) + k)
+            data, b = xp.concatenate([data, np.ones(2 * len(ids))]), xp.concatenate([b, np.zeros(1)])
+            r, c = np.concatenate([r, ids, line]), np.concatenate([c, line, ids])
+            points = None if points is None else np.concatenate([points, np.full((1, points.shape[1]), np.nan)])
+        return data, r, c, b, points
+
+    def _check_balance(self) -> None:
+        """A field without values: its data must balance, up to what the discretisation explains."""
+        self.messages.append("The conditions fix the solution only up to a constant; its mean over the particles is 0.")
+        told, certain = unbalanced(self.imbalance, self._imbalance_at, self.disc.rec.order, self.disc.rec.fields)
+        if certain:
+            self.fail(told)
+        elif told:
+            self._object(told)
+
+    def _imbalance_at(self, order: int) -> float:
+        """The mean residual, relative to the data, of the same problem with method S of another order."""
+        cloud = self.disc.cloud
+        disc = discretize(self.problem, cloud, "S", order, None, None, None)
+        other = Run(disc, self.problem, self.solver, False, True, "loo")
+        nums = numbers(disc, self.problem)
+        classes, rows = other.local_rows(nums)
+        other.solved(*matrix(disc, classes, rows), right_side(disc, nums, classes, rows), balanced=False)
+        return other.imbalance
+
+    @cached_property
+    def factor(self) -> linsolve.Factor | None:
+        """The factors of the last step's system, most often still kept; None before there was one."""
+        if self.nums is None:
+            return None
+        if self.formulation == "lsq":
+            data, r, c, _ = least_squares(self.disc, self.nums)
+        else:
+            assert self.rows is not None
+            data, r, c = matrix(self.disc, *self.rows)
+        return self.factor_of(data, r, c)
+
+    def factor_of(self, data: Any, r: Any, c: Any) -> linsolve.Factor:
+        """The factors of a global system."""
+        data, r, c, b, points = self._bordered(data, r, c, np.zeros(int((~self.disc.held).sum())))
+        return linsolve.factor(data, r, c, len(b), points, self.solver, self._elliptic)
+
+    @cached_property
+    def misfit(self) -> np.ndarray | None:
+        """By how much each particle's value misses its local fit, in the least-squares form."""
+        if self.formulation != "lsq" or self.nums is None:
+            return None
+        return misfit(self.disc, self.nums, self.values)
+
+    def condition_numbers(self) -> tuple[np.ndarray, float]:
+        """Of the particles' moment matrices (N,), and of the global system."""
+        if self.nums is None:
+            raise ValueError("condition_numbers: the solve failed before it had a system; see diagnose()")
+        assert self.factor is not None
+        whole = self.factor.condition()
+        return health.condition_numbers(self.disc, self.nums), float(whole)
+
+    def flags(self, estimated: Callable[[], float]) -> list[str]:
+        """What speaks against the solution, in sentences; see :mod:`jsmitsm.solution.flags`."""
+        if self.values is None or self.nums is None:
+            return list(self.against)
+        return flags(self, self.values, self.nums, estimated)[0] + self.against
+
+    def stats(self) -> dict[str, Any]:
+        """What a user may want to know about the solve."""
+        disc = self.disc
+        out: dict[str, Any] = {
+            "seconds": dict(self.seconds),
+            "particles": len(disc.cloud),
+            "unknowns": int((~disc.held).sum()),
+            "neighbours": max((c.neighbours.shape[1] for c in disc.classes), default=0),
+            "linear": self.linear,
+            "formulation": self.formulation,
+            "skipped": skipped(disc, self.linear, self.values is None),
+            "messages": list(self.messages),
+        }
+        if "residual" in self.linear:
+            out["residual"] = self.linear["residual"]
+        if self.health is not None:
+            out["lebesgue_max"] = self.health.largest
+            out["repaired"] = self.health.repaired
+            out["weak"] = self.health.weak
+        return out

@@ -1,0 +1,325 @@
+"""The solution: values at the particles, local Taylor polynomials, evaluation anywhere."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jsmitsm.cloud.cloud import Cloud
+from jsmitsm.cloud.quadrature import quadrature
+from jsmitsm.particle.polynomials import derivative_table, monomials
+from jsmitsm.runtime.errors import SolveError
+from jsmitsm.runtime.tracers import frozen, is_traced, owned
+from jsmitsm.solution.estimate import error_estimate
+from jsmitsm.solution.fit import Recipe
+
+# An estimated error above this part of the solution is a flag.
+LARGE = 0.1
+
+
+class Report(Protocol):
+    """What the solve can still say of itself when asked."""
+
+    def flags(self, estimated: Callable[[], float]) -> list[str]: ...
+
+    def condition_numbers(self) -> tuple[np.ndarray, float]: ...
+
+
+@jax.tree_util.register_pytree_node_class
+class Solution:
+    """A solution at the particles, and anywhere through local Taylor polynomials.
+
+    Attributes
+    ----------
+    u : (N,) values at the particles in the cloud's order, (N, F) for a system.
+    coefficients : (N, K) unscaled Taylor coefficients d^a u / a! at every particle, in the order
+        of :func:`jsmitsm.multi_indices`; (N, K, F) for a system. Fitted when first asked for.
+    converged : whether the solve met its tolerance; iterations : Newton steps (1 if linear).
+    stats : seconds per phase, sizes, what was skipped or repaired.
+
+    ``sol(points)`` evaluates it at points (M, D), ``sol.grad(points)`` its gradient.
+    A solution is a pytree: it passes through ``jax.jit``, ``jax.grad`` and ``pickle``.
+
+    Examples
+    --------
+    >>> import jax; jax.config.update("jax_enable_x64", True)
+    >>> import jsmitsm as js
+    >>> ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(1.0)}
+    >>> # The answer is x^3.
+    >>> sol = js.solve(js.Problem(lambda u, x: js.laplacian(u)(x) - 6 * x[0], ends), js.interval(0.0, 1.0, 9))
+    >>> sol
+    Solution(u: 9, method='S', order=4, converged=True)
+    >>> [round(float(value[0]), 9) for value in (sol([[0.3]]), sol.grad([[0.3]])[0], sol.derivative([[0.3]], (2,)))]
+    [0.027, 0.27, 1.8]
+    >>> round(float(sol.flux("right")), 9), sol.coefficients.shape, bool(sol.error_estimate().max() < 1e-12), sol.flags
+    (3.0, (9, 5), True, [])
+    """
+
+    def __init__(self, values, cloud, recipe, fit, converged, iterations, stats, fitted=None, report=None):
+        self._values = frozen(values)  # (N, F)
+        self.cloud: Cloud = cloud
+        self._recipe: Recipe = recipe
+        self._fit = fit  # a pytree with a method .coefficients(values) and friends
+        self._fitted = fitted  # (N, F, K) or None
+        self.converged = converged
+        self.iterations = iterations
+        self.stats: dict[str, Any] = stats
+        self._report: Report | None = report
+        self._found: list[str] | None = None  # what the report said
+        self._share = 0.0  # estimated error over solution
+
+    @property
+    def method(self) -> str:
+        """The method it was solved with, "S" for instance."""
+        return self._recipe.method
+
+    @property
+    def order(self) -> int:
+        """The degree of the local Taylor polynomials."""
+        return self._recipe.order
+
+    @property
+    def u(self) -> Any:
+        """Values (N,) at the particles, in the cloud's order; (N, F) for a system."""
+        return self._values[..., 0] if self._recipe.fields == 1 else self._values
+
+    def refuse_stacked(self) -> None:
+        """Several solutions that came out of jax.vmap as one have values, and nothing else in common."""
+        stack = jnp.shape(self._values)[:-2]
+        if stack:
+            raise ValueError(
+                f"this Solution is a stack of {'x'.join(map(str, stack))} that came out of jax.vmap, of which only u "
+                "and converged can be read: ask inside the mapped function, or take one, "
+                "jax.tree.map(lambda x: x[0], sol)"
+            )
+
+    @property
+    def coefficients(self) -> Any:
+        """Taylor coefficients d^a u / a!, (N, K), ordered as :func:`jsmitsm.multi_indices`; (N, K, F) for a system."""
+        fitted = self._taylor
+        return fitted[:, 0] if self._recipe.fields == 1 else jnp.swapaxes(fitted, 1, 2)
+
+    @property
+    def _taylor(self) -> Any:
+        """Taylor coefficients (N, F, K)."""
+        self.refuse_stacked()
+        if self._fitted is None:
+            fitted = self._fit.coefficients(self._values)
+            if is_traced(fitted):
+                return fitted
+            self._fitted = frozen(fitted)
+        return self._fitted
+
+    def __call__(self, points: Any, *, blend: bool = False) -> Any:
+        """Values (M,) at ``points`` (M, D), (M, F) for a system.
+
+        Each point takes the polynomial of its nearest particle, or with ``blend`` a smooth average
+        of those of its nearest few, which is continuous across the cloud. A point outside of the
+        domain takes the polynomial of the particle nearest to it: an extrapolation, not checked.
+
+        Raises ValueError for points of another shape, NaN or infinite ones.
+        """
+        return self.derivative(points, (0,) * self.cloud.dim, blend=blend)
+
+    def grad(self, points: Any, *, blend: bool = False) -> Any:
+        """Gradients (M, D) at ``points`` (M, D), (M, F, D) for a system; ``blend`` as for values.
+
+        Raises ValueError for points of another shape, NaN or infinite ones.
+        """
+        unit = np.eye(self.cloud.dim, dtype=int)
+        return jnp.stack([self.derivative(points, tuple(map(int, b)), blend=blend) for b in unit], axis=-1)
+
+    def derivative(self, points: Any, multi_index: tuple[int, ...], *, blend: bool = False) -> Any:
+        """The derivative d^b u at ``points`` (M, D), b = ``multi_index``, |b| at most the order: (M,) or (M, F).
+
+        With ``blend`` the polynomials' derivatives are averaged. Raises ValueError for wrong points or orders.
+        """
+        self.refuse_stacked()
+        points = _checked_points(points, self.cloud.dim)
+        whole = isinstance(multi_index, (tuple, list)) and all(isinstance(v, (int, np.integer)) for v in multi_index)
+        b = tuple(map(int, multi_index)) if whole else ()
+        if len(b) != self.cloud.dim or min(b) < 0 or sum(b) > self.order:
+            raise ValueError(
+                f"multi_index: expected {self.cloud.dim} non-negative orders with a sum of at most {self.order}, "
+                f"got {multi_index!r}"
+            )
+        near, weight = _nearest(self.cloud.points, points, self.cloud.dim + 2 if blend else 1)
+        values = _evaluate(b, self.order, self.cloud.points, self._taylor, points, near, weight)
+        return values[:, 0] if self._recipe.fields == 1 else values
+
+    def integral(self, group: str) -> Any:
+        """The integral of u over a boundary group, a scalar or (F,); see :func:`jsmitsm.quadrature`.
+
+        Raises ValueError for a group that is no boundary group.
+        """
+        self.refuse_stacked()
+        points, weights, _ = quadrature(self.cloud, group)
+        return jnp.tensordot(weights, self(points), axes=1)
+
+    def flux(self, group: str, conductivity: Any = 1.0) -> Any:
+        """The integral of conductivity n . grad u over a boundary group, n outward: a scalar or (F,).
+
+        conductivity : a number, or a function of one point x (D,).
+
+        Raises ValueError for a group that is no boundary group.
+        """
+        self.refuse_stacked()
+        points, weights, normals = quadrature(self.cloud, group)
+        if callable(conductivity):
+            conductivity = jax.vmap(conductivity)(points)
+        elif not is_traced(conductivity) and np.asarray(conductivity).dtype.kind not in "iuf":
+            raise ValueError(f"conductivity: expected a number or a function of one point x, got {conductivity!r}")
+        slope = jnp.einsum("q...d,qd->q...", self.grad(points), normals)
+        return jnp.tensordot(weights * conductivity, slope, axes=1)
+
+    def error_estimate(self) -> Any:
+        """Estimated error |u - u_exact| at every particle, (N,) or (N, F), by defect correction.
+
+        Computed when asked for: one more assembly at order p + 2 and one solve with the kept factors.
+        Raises ValueError for a solution that was pickled, and where the points are traced.
+        """
+        self.refuse_stacked()
+        if self._fit is None:
+            raise ValueError("error_estimate: this solution was pickled without its problem; ask before pickling")
+        error = error_estimate(self._fit, self._values)
+        if not is_traced(error, self._values):
+            size = np.abs(self.u).max(initial=0.0) or 1.0  # no square overflows
+            self._share = float(np.linalg.norm(error / size) / (np.linalg.norm(self.u / size) or 1.0))
+        return error
+
+    def _estimated(self) -> float:
+        """The estimated error over the solution, infinite where there is none."""
+        try:
+            self.error_estimate()
+        except (ValueError, SolveError):
+            return np.inf
+        return self._share if np.isfinite(self._share) else np.inf
+
+    @property
+    def flags(self) -> list[str]:
+        """What speaks against this solution, a sentence each; none for a healthy one.
+
+        Tested when first asked for: roughness between neighbours, near singularity, an unresolved
+        source, hopeless stencils, misfits of the equation. Where only the resolution is in doubt, an
+        error estimate below 1 % clears it and one above 10 % confirms it (scalar linear problems of
+        up to 200,000 particles). An error estimate asked for before counts as well. No flag is no proof.
+        """
+        self.refuse_stacked()
+        if self._found is None and self._report is not None:
+            self._found = self._report.flags(self._estimated)
+        large = f"The estimated error is {self._share:.0%} of the solution: refine the cloud, or change the order."
+        return [*(self._found or []), *([] if self._share <= LARGE else [large])]
+
+    def condition_numbers(self) -> tuple[Any, float]:
+        """The condition number (N,) of every particle's moment matrix, and an estimate of the global system's.
+
+        The matrices are those with rows and columns scaled to about one, so that units do not count.
+        NaN for particles whose values are held. They say how many digits round-off may take; they do not
+        predict the error: the Lebesgue constants do more.
+
+        Raises ValueError for a solution that was pickled or made under ``jax.jit``.
+        """
+        if self._report is None:
+            raise ValueError(
+                "condition_numbers: this solution was pickled or made by a JAX transform, and its systems are gone; "
+                "solve outside and ask before pickling"
+            )
+        return self._report.condition_numbers()
+
+    def diagnose(self) -> str:
+        """In words: how the solve went, which particles were weak and what was done."""
+        self.refuse_stacked()
+        s = self.stats
+        lines = [repr(self)]
+        if not bool(self.converged):
+            lines.append("The solve did NOT converge; do not trust these values.")
+        told = s.get("messages", [])
+        lines += [f"FLAG: {line}" for line in self.flags if line not in told]
+        lines += [str(line) for line in told]
+        if "lebesgue_max" in s:
+            lines.append(f"Largest Lebesgue constant {s['lebesgue_max']:.3g} (up to 1.5 is healthy).")
+        if "residual" in s:
+            lines.append(f"Relative residual of the global system {s['residual']:.1e}.")
+        return "\n".join(lines)
+
+    def __repr__(self) -> str:
+        shape = "x".join(map(str, self.u.shape))
+        state = "" if is_traced(self.converged) else f", converged={bool(np.all(self.converged))}"
+        return f"Solution(u: {shape}, method={self.method!r}, order={self.order}{state})"
+
+    def tree_flatten(self):
+        return (self._values, self.cloud, self._fit, self._fitted, self.converged, self.iterations), self._recipe
+
+    @classmethod
+    def tree_unflatten(cls, recipe, leaves):
+        new = object.__new__(cls)
+        new._values, new.cloud, new._fit, new._fitted, new.converged, new.iterations = leaves
+        new._values, new._fitted = owned(new._values), owned(new._fitted)
+        new._recipe = recipe
+        new.stats = {}
+        new._report, new._found, new._share = None, None, 0.0
+        return new
+
+    def __getstate__(self):
+        # Records need not pickle: what they give, the local polynomials, does.
+        fitted = jax.tree.map(np.asarray, self._taylor)
+        return {**self.__dict__, "_fit": None, "_fitted": fitted, "_found": self.flags, "_report": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update({name: frozen(value) for name, value in state.items()})
+
+
+def _checked_points(points: Any, dim: int) -> Any:
+    if not is_traced(points):
+        try:
+            if np.iscomplexobj(points):
+                raise TypeError
+            points = np.asarray(points, dtype=float)
+        except (TypeError, ValueError):
+            raise ValueError(
+                f"points: expected real numbers of shape (M, {dim}), got {type(points).__name__}"
+            ) from None
+        if points.ndim == 2 and not np.isfinite(points).all():
+            raise ValueError("points: NaN or infinite coordinates; evaluate at finite points")
+    if points.ndim != 2 or points.shape[1] != dim:
+        raise ValueError(f"points: expected shape (M, {dim}), got {points.shape}; one point is points[None, :]")
+    return points
+
+
+def _nearest(centres: Any, points: Any, count: int) -> tuple[Any, Any]:
+    """The nearest particles (M, count) of each point and their weights, which sum to one."""
+    count = min(count, centres.shape[0])
+    if is_traced(centres, points):
+        square = jnp.sum((jax.lax.stop_gradient(points)[:, None] - jax.lax.stop_gradient(centres)[None]) ** 2, axis=2)
+        index = jax.lax.top_k(-square, count)[1]
+    else:
+        from scipy.spatial import cKDTree
+
+        index = cKDTree(np.asarray(centres)).query(points, k=range(1, count + 1))[1]
+    if count == 1:
+        return index, np.ones(index.shape)
+    xp = jnp if is_traced(centres, points) else np
+    square = xp.sum((points[:, None] - xp.asarray(centres)[index]) ** 2, axis=2)
+    # At a particle the root has no slope; it is taken as zero there.
+    distance = xp.where(square > 0, xp.sqrt(xp.where(square > 0, square, 1.0)), 0.0)
+    # The farthest of them gets weight zero, so that none enters or leaves with a jump.
+    weight = xp.maximum(1.0 - distance / distance.max(axis=1, keepdims=True), 0.0) ** 2
+    weight = weight + 1e-12  # where all are equally far; its square is a number in float32 too
+    return index, weight / weight.sum(axis=1, keepdims=True)
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _evaluate(b, order, centres, taylor, points, near, weight):
+    """sum_k weight[k] d^b p_k(x): (M, F)."""
+    dim = points.shape[1]
+    lower, factor = derivative_table(dim, order, b)
+    total = 0.0
+    for k in range(near.shape[1]):
+        p = monomials(points - centres[near[:, k]], order)[:, lower] * factor
+        total = total + weight[:, k, None] * jnp.einsum("mfk,mk->mf", taylor[near[:, k]], p)
+    return total

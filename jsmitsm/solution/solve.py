@@ -1,0 +1,94 @@
+"""Solve a boundary-value problem: the one verb of the package."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+from jsmitsm.cloud.cloud import Cloud
+from jsmitsm.cloud.neighbours import Stencils
+from jsmitsm.discretization.coefficients import numbers
+from jsmitsm.discretization.layout import discretize, table
+from jsmitsm.equation.problem import Problem
+from jsmitsm.particle.kernels import Kernel
+from jsmitsm.runtime.progress import bar
+from jsmitsm.runtime.tracers import is_traced
+from jsmitsm.solution.arguments import check
+from jsmitsm.solution.fit import Fit, Recipe
+from jsmitsm.solution.newton import newton
+from jsmitsm.solution.run import Run
+from jsmitsm.solution.solution import Solution
+
+
+@bar("solve")
+def solve(
+    problem: Problem,
+    cloud: Cloud,
+    *,
+    method: str = "S",
+    order: int = 4,
+    kernel: Kernel | None = None,
+    stencils: Stencils | None = None,
+    basis_terms: int | None = None,
+    formulation: str = "auto",
+    solver: str = "auto",
+    u0: Any = None,
+    throw: bool = True,
+) -> Solution:
+    """Solve ``problem`` on ``cloud``.
+
+    Parameters
+    ----------
+    method : "I", "II", "III" (SMITSM, Karamanli 2015), "SSPH", or "S", the recursion with
+        symmetric moment rows.
+    order : total degree of the local Taylor expansions.
+    kernel : weights and supports; chosen from the cloud, the order and the method if not given.
+    stencils : from :func:`jsmitsm.stencils`; needed where JAX traces ``h``, ``d`` or the points.
+    basis_terms : keep only the first so many free coefficients (I, II, III).
+    formulation : "loo" (each value is predicted by its neighbours), "lsq" (least squares over
+        all local fits) or "auto".
+    solver : "auto", "dense" (pure JAX), "sparse" (direct), "mixed" (direct, its factors in float32
+        and the rest in float64: two thirds of the time and memory) or "iterative".
+    u0 : start of Newton's method for a nonlinear problem: (N,), (N, F) or a function of x.
+    throw : raise :class:`jsmitsm.SolveError` where the solve fails; otherwise, and always under
+        jit, ``converged`` is False.
+
+    Raises
+    ------
+    ValueError
+        For bad input, with the argument, what came, what was expected and what to do.
+    SolveError
+        For a singular or non-finite system, with the particles at fault.
+
+    Examples
+    --------
+    >>> import jax; jax.config.update("jax_enable_x64", True)
+    >>> import jsmitsm as js
+    >>> cloud = js.interval(0.0, 2.0, 20)
+    >>> problem = js.Problem(
+    ...     pde=lambda u, x: js.laplacian(u)(x) - x[0] ** 3,
+    ...     bcs={"left": js.dirichlet(1.0), "right": js.dirichlet(6.6)},
+    ... )
+    >>> sol = js.solve(problem, cloud, order=5)
+    >>> bool(abs(sol.u - (cloud.points[:, 0] ** 5 / 20 + 2 * cloud.points[:, 0] + 1)).max() < 1e-12)
+    True
+    """
+    start = time.perf_counter()
+    check(problem, cloud, method, order, kernel, stencils, formulation, solver, u0, throw)
+    disc = discretize(problem, cloud, method, order, kernel, stencils, basis_terms, sources=False)
+    problem = disc.problem
+    run = Run(disc, problem, solver, throw, kernel is None and stencils is None, formulation)
+    run.seconds["set-up"] = time.perf_counter() - start
+    if not disc.classes:
+        raise ValueError("problem: every particle's value is held; nothing is left to solve for")
+    if disc.linear:
+        nums = numbers(disc, problem)
+        values, good = run.step(nums)
+        taylor, iterations = None, 1
+    else:
+        values, taylor, good, iterations = newton(run, u0)
+    run.seconds["total"] = time.perf_counter() - start
+    recipe = Recipe(method, order, basis_terms, run.formulation, problem.fields)
+    fit = Fit(problem, cloud, disc.kernel, table(disc), taylor, recipe)
+    report = None if is_traced(values) else run
+    return Solution(values, cloud, recipe, fit, good, iterations, run.stats(), report=report)

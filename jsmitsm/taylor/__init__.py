@@ -1,0 +1,4 @@
+"""Truncated Taylor arithmetic: multi-indices, series, a rule for every primitive, jets of traced functions.
+
+Imports runtime.
+"""

@@ -1,0 +1,175 @@
+"""Choose a kernel's parameters by gradient descent, without knowing the exact solution.
+
+The objective "estimate" is the distance to one reference solution of higher order, computed once,
+held by a bound on the Lebesgue constant: without it the descent finds kernels that are accurate
+only for the very numbers they were tuned to.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import jax
+import numpy as np
+
+from jsmitsm.cloud.cloud import Cloud
+from jsmitsm.equation.problem import Problem
+from jsmitsm.particle.kernels import Kernel
+from jsmitsm.runtime.progress import bar
+from jsmitsm.runtime.tracers import is_traced
+from jsmitsm.solution.arguments import check
+from jsmitsm.solution.solution import Solution
+from jsmitsm.solution.solve import solve
+from jsmitsm.tuning.descent import Descent
+from jsmitsm.tuning.objective import Objective
+from jsmitsm.tuning.parameter_maps import ParameterMap
+
+OPTIONS = ("method", "order", "stencils", "basis_terms", "formulation", "solver", "u0", "throw")
+
+
+@dataclass
+class TuneResult:
+    """What :func:`tune` found.
+
+    Attributes
+    ----------
+    kernel : the best kernel met, never worse than the one it started from.
+    solution : the solution with it.
+    history : per evaluated step, ready to plot: ``"objective"`` (for "estimate" the relative
+        distance to the reference solution), ``"lebesgue"`` (the largest Lebesgue constant), and
+        each tuned parameter under its name, (steps,) or (steps, N); ``"params"`` has the form of
+        the kernel's own, every leaf with a leading axis of steps.
+    messages : in words, where tuning had to step back, widen a support or stop.
+    solves : number of solves, those of the reference and of the returned solution included.
+    """
+
+    kernel: Kernel
+    solution: Solution
+    history: dict[str, Any]
+    messages: list[str] = field(default_factory=list)
+    solves: int = 0
+
+    def __repr__(self) -> str:
+        seen = self.history["objective"]
+        best = np.nanmin(seen) if len(seen) else np.nan
+        return f"TuneResult({self.kernel!r}, objective {seen[0]:.3g} -> {best:.3g}, {self.solves} solves)"
+
+
+def tune(
+    problem: Problem,
+    cloud: Cloud,
+    kernel: Kernel,
+    *,
+    objective: str | Callable[[Solution], Any] = "estimate",
+    parameters: tuple[str, ...] = ("h", "d"),
+    optimizer: Any = None,
+    steps: int = 50,
+    progress: bool = True,
+    groups: Any = None,
+    **solve_options: Any,
+) -> TuneResult:
+    """Tune the parameters of a kernel by gradient descent.
+
+    Positive parameters are changed on their logarithms, so they stay positive; the support is kept
+    wide enough that every particle has the neighbours its fit needs. Where a solve fails or an
+    objective is not finite, the search returns to the best kernel found and halves its step.
+
+    Parameters
+    ----------
+    kernel : where to start. ``h`` scalar, or (N,) to tune one smoothing length per particle.
+    objective : "estimate", the distance to a reference solution of higher order that is computed
+        once; or a function of a :class:`jsmitsm.Solution` that returns a scalar to be made small.
+        Both are held by a bound on the Lebesgue constant: 1.5, or that of h = spacing, d = 4.
+    parameters : some of "h", "d" and, for a kernel that has them, "params". Every floating-point
+        leaf of ``params`` is tuned, its sign kept where it starts positive.
+    optimizer : any optax transformation; Adam with a decaying step if not given.
+    steps : at most so many steps; fewer where nothing is gained any more.
+    progress : show a bar, where tqdm is installed and stderr is a terminal.
+    groups : (N,) whole numbers; particles with the same one share a factor on ``h``, so that a
+        graded ``h`` keeps its grading.
+    solve_options : ``method``, ``order`` and the others of :func:`jsmitsm.solve`.
+
+    Raises
+    ------
+    ValueError
+        For bad input, such as a parameter that the kernel lacks.
+    SolveError
+        If the problem cannot be solved with the starting kernel, nor with wider ones.
+
+    Examples
+    --------
+    >>> import jax; jax.config.update("jax_enable_x64", True)
+    >>> import jax.numpy as jnp
+    >>> import jsmitsm as js
+    >>> cloud = js.interval(0.0, 1.0, 17)
+    >>> ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(0.0)}
+    >>> problem = js.Problem(lambda u, x: js.laplacian(u)(x) + jnp.sin(jnp.pi * x[0]), ends)
+    >>> start = js.SuperGaussian(h=2 * cloud.spacing, d=4.0)
+    >>> found = js.tune(problem, cloud, start, order=3, steps=10)
+    >>> bool(found.history["objective"].min() < found.history["objective"][0] / 2)
+    True
+    """
+    names = _checked_names(kernel, parameters)
+    _check_input(problem, cloud, kernel, objective, optimizer, steps, solve_options)
+    options = {"method": "S", "order": 4, **solve_options}
+    space = ParameterMap(kernel, names, _checked_groups(groups, cloud, names))
+    with bar("tune", steps, progress) as shown:
+        scored = Objective(problem, cloud, kernel, objective, options)
+        search = Descent(space, scored, optimizer, steps)
+        search.run(shown)
+        best = search.best
+        if not scored.linear:
+            options["u0"] = best.score.values
+        solution = solve(problem, cloud, kernel=best.kernel, **options)
+    return TuneResult(best.kernel, solution, search.history(), search.messages, scored.solves + 1)
+
+
+# ------------------------------------------------------------------ input
+
+
+def _checked_names(kernel: Any, parameters: Any) -> tuple[str, ...]:
+    if not isinstance(kernel, Kernel):
+        raise ValueError(
+            f"kernel: expected a kernel to start from such as js.SuperGaussian(cloud.spacing, 4.0), got {kernel!r}"
+        )
+    names = (parameters,) if isinstance(parameters, str) else tuple(parameters)
+    known = ["h", "d"] + (["params"] if jax.tree.leaves(kernel.params) else [])
+    for name in names:
+        if name not in known:
+            raise ValueError(
+                f"parameters: {name!r} is no parameter of {type(kernel).__name__}; it has {', '.join(map(repr, known))}"
+            )
+    if not names or len(set(names)) < len(names):
+        raise ValueError(f"parameters: expected some of {', '.join(map(repr, known))}, each once, got {parameters!r}")
+    return names
+
+
+def _check_input(problem, cloud, kernel, objective, optimizer, steps, options) -> None:
+    for name in options:
+        if name not in OPTIONS:
+            raise ValueError(f"{name}: no argument of js.tune or js.solve; those of js.solve are {', '.join(OPTIONS)}")
+    o = {"method": "S", "order": 4, "formulation": "auto", "solver": "auto", "stencils": None, **options}
+    check(problem, cloud, o["method"], o["order"], kernel, o["stencils"], o["formulation"], o["solver"])
+    if is_traced(kernel, cloud, problem.params):
+        raise ValueError("kernel, cloud, problem: traced by a JAX transform; js.tune runs on the host, call it outside")
+    if objective != "estimate" and not callable(objective):
+        raise ValueError(f'objective: expected "estimate" or a function of a Solution, got {objective!r}')
+    if optimizer is not None and not (hasattr(optimizer, "init") and hasattr(optimizer, "update")):
+        raise ValueError(f"optimizer: expected an optax transformation such as optax.adam(0.1), got {optimizer!r}")
+    if isinstance(steps, bool) or not isinstance(steps, (int, np.integer)) or steps < 0:
+        raise ValueError(f"steps: expected a whole number, 0 or more, got {steps!r}")
+
+
+def _checked_groups(groups: Any, cloud: Cloud, names: tuple[str, ...]) -> np.ndarray | None:
+    if groups is None:
+        return None
+    array = np.asarray(groups)
+    if array.shape != (len(cloud),) or array.dtype.kind not in "iu":
+        raise ValueError(
+            f"groups: expected ({len(cloud)},) whole numbers, one per particle, got {array.dtype} {array.shape}"
+        )
+    if "h" not in names:
+        raise ValueError(f'groups: particles share a factor on h, but parameters={names!r} does not tune "h"')
+    return array
