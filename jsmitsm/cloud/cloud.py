@@ -84,8 +84,11 @@ class Cloud:
     def __setattr__(self, name: str, value: Any) -> None:
         # What was solved on a cloud rests on it.
         if name in ("points", "groups", "normals") and name in self.__dict__:
-            raise AttributeError(f"{name}: a Cloud does not change; make another, cloud.replace({name}=...) or js.Cloud")
+            raise AttributeError(f"{name}: a Cloud does not change; take cloud.replace({name}=...) or a new js.Cloud")
         object.__setattr__(self, name, value)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in self.__dict__.items() if name != "_inside"}  # made again when needed
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update({name: frozen(value) for name, value in state.items()})

@@ -23,7 +23,7 @@ class Form:
         return t._fingerprint, fixed, self.moving, t.dim, t.fields, t.slots, t._n_extras, t._params_tree
 
     def __eq__(self, other: object) -> bool:
-        return self is other or (isinstance(other, _Form) and self._key == other._key)
+        return self is other or (isinstance(other, Form) and self._key == other._key)
 
     def __hash__(self) -> int:
         return hash(self._key)
