@@ -11,8 +11,9 @@ import numpy as np
 
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.cloud.neighbours import Stencils
+from jsmitsm.cloud.walls import Walls, seen
 from jsmitsm.discretization.periodic import Images, periodic_images, with_corners
-from jsmitsm.discretization.supports import check_supports, cut_off, default_kernel, find_stencils
+from jsmitsm.discretization.supports import check_supports, cut_off, default_kernel, find_stencils, walls_of
 from jsmitsm.equation.closing import closed, in_words
 from jsmitsm.equation.conditions import Group, group_conditions
 from jsmitsm.equation.problem import Problem
@@ -55,6 +56,7 @@ class Discretization:
     partner: np.ndarray  # (N,) the particle whose value each one has: itself but for periodic images
     images: Images
     n_own: np.ndarray  # (N,) own conditions of each particle
+    walls: Walls | None  # what hides particles from one another
     given_stencils: bool  # the user's: nothing outside them is looked at
     basis_terms: int | None = None  # free coefficients kept, all of them if not given
     repeated: int = 0  # particles whose moment system was that of another
@@ -134,16 +136,19 @@ def discretize(
         raise ValueError(
             f"kernel: the derivatives of js.Constant vanish, and method {method} tests with them; use another kernel"
         )
-    given_stencils = stencils is not None
+    given_stencils, walls = stencils is not None, walls_of(problem, cloud, images)
     if stencils is None:
-        stencils = find_stencils(cloud, kernel, scheme, images, np.flatnonzero((n_own > 0) & ~held.all(axis=1)))
+        conditioned = np.flatnonzero((n_own > 0) & ~held.all(axis=1))
+        stencils = find_stencils(cloud, kernel, scheme, images, conditioned, walls)
     elif len(stencils) != len(cloud):
         raise ValueError(f"stencils: built for {len(stencils)} particles, the cloud has {len(cloud)}; build them again")
+    elif stencils.radius is not None and not is_traced(stencils):  # those of a former solve were looked at then
+        stencils = seen(stencils, None, walls)
     if kernel is None and method in ("I", "II"):
         kernel = default_kernel(cloud.points, np.arange(len(cloud)), stencils.indices)
     disc = Discretization(
-        problem, cloud, kernel, stencils, traced, rec, groups, scheme, [], held, partner, images, n_own, given_stencils,
-        basis_terms,
+        problem, cloud, kernel, stencils, traced, rec, groups, scheme, [], held, partner, images, n_own, walls,
+        given_stencils,        basis_terms,
     )  # fmt: skip
     if given_stencils or kernel is not None:
         check_supports(scheme, stencils, kernel, disc.points, n_own, disc.active)
