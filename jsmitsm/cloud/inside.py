@@ -106,6 +106,33 @@ class Inside:
         given[bare] = np.where(np.abs(side) > _FRONT, np.sign(side), 0.0)[:, None] * across
         return np.where((given != 0).any(axis=1, keepdims=True) & np.isfinite(given), given, fitted)
 
+    @cached_property
+    def facing(self) -> bool:
+        """Whether boundary particles have others straight before them: parts of the domain come close to each other."""
+        count = min(4 * self.dim + 1, len(self.points))
+        rim = self.points[self.boundary]
+        if not len(rim) or count < 2:
+            return False
+        distance, near = self.trees[0].query(rim, k=count)
+        height = np.einsum("bkd,bd->bk", self.points[near] - rim[:, None], self.normals)
+        return bool((height[:, 1:] > 0.5 * distance[:, 1:]).any())
+
+    def nearest(self, points: np.ndarray, count: int) -> np.ndarray:
+        """The nearest particles (M, count) of points (M, D); those across a gap come last."""
+        more = min(count + 4 * self.dim, len(self.points)) if self.facing else count
+        distance, near = self.trees[0].query(points, k=range(1, more + 1))
+        if more == count:
+            return near
+        place = self.place[near]
+        offset = points[:, None] - self.points[near]
+        height = np.where(place >= 0, np.einsum("mkd,mkd->mk", offset, self.normals[place]), 0.0)
+        across = height > np.maximum(0.02 * self.spacing[near], 0.1 * distance)
+        # A point outside is before all boundary particles around; the nearest serves it.
+        others = ~across & (distance <= _FAR * self.spacing[near])
+        moved = across[:, 0] & others.any(axis=1)
+        order = np.argsort(across & moved[:, None], axis=1, kind="stable")[:, :count]
+        return np.take_along_axis(near, order, axis=1)
+
     def outside(self, points: Any) -> Any:
         """Mask (M,) of the points (M, D) outside."""
         host = concrete(points)
@@ -173,7 +200,7 @@ def _where(mask: Any, out: Any, points: Any, judge: Any, *more: Any) -> Any:
 
 
 def inside_of(cloud: Cloud) -> Inside | None:
-    """What tells inside from outside, kept with the cloud; None where its points are traced and nothing is known of them."""
+    """What tells inside from outside, kept with the cloud; None where its points are traced by jit or vmap."""
     found = cloud.__dict__.get("_inside")
     if found is None:
         points, normals = concrete(cloud.points), concrete(cloud.normals)

@@ -1,8 +1,8 @@
 """Which neighbours a particle sees: those behind a boundary (across a gap, a slit, a notch) are none.
 
-Where two parts of the boundary face each other within the reach of a stencil, the particles around are joined to a graph
-of their nearest ones, links that leave the domain are cut, and a neighbour counts as one if the way to it in that graph
-is not much longer than the straight one. Round a blunt corner or a round hole it is not; across a gap there is none.
+Where two parts of the boundary face each other within the reach of a stencil, the particles around are linked to their
+nearest ones, links that leave the domain are cut, and a neighbour counts as one if the way to it along the links is not
+much longer than the straight one. Round a blunt corner or a round hole it is not; across a gap there is none.
 """
 
 from __future__ import annotations

@@ -75,8 +75,8 @@ def find_stencils(
         few = np.flatnonzero(counts < needed)
         if len(few):
             raise ValueError(
-                f"cloud: {len(few)} particle(s), e.g. particle {few[0]}, see only {counts[few[0]]} of the {needed} that "
-                "a stencil of this order needs, themselves counted: the boundary cuts the others off; add particles to "
+                f"cloud: {len(few)} particle(s), e.g. particle {few[0]}, see only {counts[few[0]]} of the {needed} "
+                "that a stencil of this order needs, themselves counted: the boundary cuts the others off; add particles to "
                 "that part of the domain, or lower the order"
             )
     return found

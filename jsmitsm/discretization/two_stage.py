@@ -80,7 +80,8 @@ def _recovery_kernel(disc: Discretization) -> tuple[Kernel, Any]:
     # Inside the support, and where the weight is not yet lost to rounding.
     wide = kernel.replace(h=xp.maximum(kernel.h, reach / xp.minimum(0.9 * kernel.d, _FAR)))
     if near is None:
-        near = within_seen(np.asarray(points), np.maximum(kernel.h * np.asarray(kernel.d), reach / 0.9), None, disc.walls).indices
+        radius = np.maximum(kernel.h * np.asarray(kernel.d), reach / 0.9)
+        near = within_seen(np.asarray(points), radius, None, disc.walls).indices
     return wide, near
 
 

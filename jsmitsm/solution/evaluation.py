@@ -61,16 +61,15 @@ def checked_points(points: Any, dim: int) -> Any:
     return points
 
 
-def nearest_particles(centres: Any, points: Any, count: int) -> tuple[Any, Any]:
+def nearest_particles(cloud: Cloud, points: Any, count: int) -> tuple[Any, Any]:
     """The nearest particles (M, count) of each point and their weights, which sum to one."""
-    count = min(count, centres.shape[0])
-    if is_traced(centres, points):
+    centres = cloud.points
+    count, domain = min(count, centres.shape[0]), None if is_traced(centres, points) else inside_of(cloud)
+    if domain is None:
         square = jnp.sum((jax.lax.stop_gradient(points)[:, None] - jax.lax.stop_gradient(centres)[None]) ** 2, axis=2)
         index = jax.lax.top_k(-square, count)[1]
     else:
-        from scipy.spatial import cKDTree
-
-        index = cKDTree(np.asarray(centres)).query(points, k=range(1, count + 1))[1]
+        index = domain.nearest(points, count)
     if count == 1:
         return index, np.ones(index.shape)
     xp = jnp if is_traced(centres, points) else np

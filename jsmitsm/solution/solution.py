@@ -155,19 +155,27 @@ class Solution:
                 f"multi_index: expected {self.cloud.dim} non-negative orders with a sum of at most {self.order}, "
                 f"got {multi_index!r}"
             )
-        near, weight = nearest_particles(self.cloud.points, points, self.cloud.dim + 2 if blend else 1)
+        near, weight = nearest_particles(self.cloud, points, self.cloud.dim + 2 if blend else 1)
         inside = in_domain(self.cloud, points, outside)
         values = evaluated(b, self.order, self.cloud.points, self._taylor, points, near, weight)
         values = values if inside is None else jnp.where(inside[:, None], values, jnp.nan)
         return values[:, 0] if self._recipe.fields == 1 else values
 
-    def integral(self, group: str) -> Any:
-        """The integral of u over a boundary group, a scalar or (F,); see :func:`jsmitsm.quadrature`.
+    def integral(self, group: str | None = None) -> Any:
+        """The integral of u over a boundary group, or without a name over the domain: a scalar or (F,).
 
+        That over the domain has the order of the solution, on curved domains too; see :func:`jsmitsm.quadrature`.
         Raises ValueError for a group that is no boundary group.
+
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import jsmitsm as js
+        >>> ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(1.0)}
+        >>> sol = js.solve(js.Problem(lambda u, x: js.laplacian(u)(x) - 2.0, ends), js.interval(0.0, 1.0, 9))
+        >>> round(float(sol.integral()), 12)  # of x^2
+        0.333333333333
         """
         self.refuse_stacked()
-        points, weights, _ = quadrature(self.cloud, group)
+        points, weights, _ = quadrature(self.cloud, group, self.order)
         return jnp.tensordot(weights, self(points, outside="extrapolate"), axes=1)
 
     def flux(self, group: str, conductivity: Any = 1.0) -> Any:
