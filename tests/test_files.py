@@ -80,14 +80,15 @@ def test_gmsh_file_with_physical_names(tmp_path):
     mesh.write(tmp_path / "square.msh", file_format="gmsh22", binary=False)
     cloud = from_mesh(tmp_path / "square.msh")
     assert len(cloud) == 9 and cloud.points.max() == 2.0
-    # The file lists names by number: "bottom" takes the corner; "inner" keeps the end that lies on the boundary.
+    # The file lists names by number: "bottom" takes the corner; "inner" is no side, also where it ends on the boundary.
     assert {k: cloud.points[v].tolist() for k, v in cloud.groups.items()} == {
         "interior": [[1, 1]],
         "right": [[2, 1], [2, 2]],
         "bottom": [[0, 0], [1, 0], [2, 0]],
-        "inner": [[0, 1]],
-        "boundary": [[0, 2], [1, 2]],
+        "boundary": [[0, 1], [0, 2], [1, 2]],
     }
+    assert {k: cloud.points[v].tolist() for k, v in cloud.cell_groups.items() if k != "all"} == {"inner": [[0, 1], [1, 1]]}
+    assert len(cloud.cell_groups["all"]) == 9
     np.testing.assert_allclose(cloud.normals[cloud.groups["bottom"]][1], [0, -1])
     # In memory "right" is named first.
     assert from_mesh(mesh).points[from_mesh(mesh).groups["right"]].tolist() == [[2, 0], [2, 1], [2, 2]]

@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from jsmitsm.runtime.errors import some
+from jsmitsm.runtime.errors import refuse_masked, some
 from jsmitsm.runtime.tracers import frozen, owned
 
 INTERIOR = "interior"
@@ -58,14 +58,16 @@ class Cloud:
         particle; ``"interior"`` is one of them, every other one is a boundary group.
     normals : (N, D) unit outward normals, NaN in the interior. Needed only where a boundary
         condition uses them.
+    cell_groups : maps a name to an integer index array, as the materials of a mesh do: these may overlap (a particle
+        between two materials belongs to both) and need not cover the cloud. No condition refers to them.
 
     Raises
     ------
     ValueError
         For a wrong shape, NaN, overlapping or incomplete groups, duplicate particles.
 
-    A cloud is a pytree: points and normals are leaves, groups are static. It does not change: its arrays are
-    read-only copies, and :meth:`replace` makes another one.
+    A cloud is a pytree: points and normals are leaves, groups and cell groups are static. It does not change: its
+    arrays are read-only copies, and :meth:`replace` makes another one.
 
     Examples
     --------
@@ -75,15 +77,24 @@ class Cloud:
     (3, 0.5)
     """
 
-    def __init__(self, points: Any, groups: Mapping[str, Any], normals: Any = None):
+    cell_groups = Groups({})  # also of clouds pickled before there were any
+
+    def __init__(
+        self,
+        points: Any,
+        groups: Mapping[str, Any],
+        normals: Any = None,
+        cell_groups: Mapping[str, Any] | None = None,
+    ):
         self.points = _checked_points(points)
         self.groups = _checked_groups(groups, len(self.points))
         self.normals = _checked_normals(normals, self.points, self.groups)
+        self.cell_groups = _checked_cell_groups(cell_groups, len(self.points))
         self._spacing: float | None = None
 
     def __setattr__(self, name: str, value: Any) -> None:
         # What was solved on a cloud rests on it.
-        if name in ("points", "groups", "normals") and name in self.__dict__:
+        if name in ("points", "groups", "normals", "cell_groups") and name in self.__dict__:
             raise AttributeError(f"{name}: a Cloud does not change; take cloud.replace({name}=...) or a new js.Cloud")
         object.__setattr__(self, name, value)
 
@@ -130,6 +141,7 @@ class Cloud:
             )
         new.points = self.points if points is None else _checked_points(points)
         new.groups = self.groups
+        new.cell_groups = self.cell_groups
         new.normals = self.normals if normals is None else _checked_normals(normals, new.points, self.groups)
         new._spacing = None if points is not None else self._spacing
         return new
@@ -138,16 +150,17 @@ class Cloud:
         return self.points.shape[0]
 
     def __repr__(self) -> str:
-        return f"Cloud({len(self)} particles in {self.dim}D, groups {self.groups!r})"
+        cells = f", cell groups {self.cell_groups!r}" if self.cell_groups else ""
+        return f"Cloud({len(self)} particles in {self.dim}D, groups {self.groups!r}{cells})"
 
     def tree_flatten(self):
-        return (self.points, self.normals), self.groups
+        return (self.points, self.normals), (self.groups, self.cell_groups)
 
     @classmethod
-    def tree_unflatten(cls, groups, leaves):
+    def tree_unflatten(cls, static, leaves):
         new = object.__new__(cls)
         new.points, new.normals = map(owned, leaves)
-        new.groups = groups
+        new.groups, new.cell_groups = static
         new._spacing = None
         return new
 
@@ -157,6 +170,7 @@ def _checked_points(points: Any) -> Any:
     if isinstance(points, jax.core.Tracer):
         shape = points.shape
     else:
+        refuse_masked(points, "points")
         try:
             array = np.asarray(points)
             if array.dtype.kind not in "fiu":
@@ -200,25 +214,8 @@ def _checked_groups(groups: Mapping[str, Any], n: int) -> Groups:
     owner = np.full(n, -1)
     checked = {}
     for k, (name, index) in enumerate(groups.items()):
-        if not isinstance(name, str):
-            raise ValueError(f"groups: the name {name!r} of a group is no string; write e.g. {str(name)!r}")
-        try:
-            index = np.asarray(index)
-            if index.size == 0:
-                index = index.astype(np.int64).reshape(-1)
-            if index.ndim != 1 or index.dtype.kind not in "iu":
-                raise ValueError
-        except ValueError:
-            came = f"{index.dtype} of shape {index.shape}" if isinstance(index, np.ndarray) else f"{index!r}"
-            raise ValueError(
-                f"groups[{name!r}]: expected a 1D integer index array, got {came}; "
-                "turn a mask into indices with np.flatnonzero"
-            ) from None
-        if index.size and (index.min() < 0 or index.max() >= n):
-            raise ValueError(
-                f"groups[{name!r}]: indices from {index.min()} to {index.max()}, expected 0 to {n - 1} "
-                f"for {n} particles"
-            )
+        _check_name("groups", name)
+        index = _checked_index(f"groups[{name!r}]", index, n)
         once, count = np.unique(index, return_counts=True)
         taken = once[(owner[once] >= 0) | (count > 1)]
         if len(taken):
@@ -236,6 +233,43 @@ def _checked_groups(groups: Mapping[str, Any], n: int) -> Groups:
     return Groups(checked)
 
 
+def _checked_cell_groups(groups: Any, n: int) -> Groups:
+    """Named sets of particles that may overlap."""
+    if not isinstance(groups, Mapping) and groups is not None:
+        raise ValueError(f"cell_groups: expected a dict of index arrays, got {type(groups).__name__}")
+    checked = {}
+    for name, index in (groups or {}).items():
+        _check_name("cell_groups", name)
+        checked[name] = np.unique(_checked_index(f"cell_groups[{name!r}]", index, n))
+    return Groups(checked)
+
+
+def _check_name(what: str, name: Any) -> None:
+    if not isinstance(name, str):
+        raise ValueError(f"{what}: the name {name!r} of a group is no string; write e.g. {str(name)!r}")
+
+
+def _checked_index(what: str, index: Any, n: int) -> np.ndarray:
+    """Indices of particles (K,)."""
+    refuse_masked(index, what)
+    try:
+        index = np.asarray(index)
+        if index.size == 0:
+            index = index.astype(np.int64).reshape(-1)
+        if index.ndim != 1 or index.dtype.kind not in "iu":
+            raise ValueError
+    except ValueError:
+        came = f"{index.dtype} of shape {index.shape}" if isinstance(index, np.ndarray) else f"{index!r}"
+        raise ValueError(
+            f"{what}: expected a 1D integer index array, got {came}; turn a mask into indices with np.flatnonzero"
+        ) from None
+    if index.size and (index.min() < 0 or index.max() >= n):
+        raise ValueError(
+            f"{what}: indices from {index.min()} to {index.max()}, expected 0 to {n - 1} for {n} particles"
+        )
+    return index
+
+
 def _checked_normals(normals: Any, points: Any, groups: Groups) -> Any:
     """Unit normals at the boundary, NaN inside; None and traced arrays pass through."""
     if normals is None:
@@ -244,6 +278,8 @@ def _checked_normals(normals: Any, points: Any, groups: Groups) -> Any:
         raise ValueError(f"normals: expected shape {points.shape} like points, got {np.shape(normals)}")
     if isinstance(normals, jax.core.Tracer):
         return normals
+    if np.ma.isMaskedArray(normals):  # what is masked has none, as the interior
+        normals = np.ma.filled(normals.astype(np.float64), np.nan)
     try:
         normals = np.asarray(normals)
         if normals.dtype.kind == "c":

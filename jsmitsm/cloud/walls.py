@@ -305,6 +305,6 @@ def check_outward(walls: Walls, table: np.ndarray, names: dict[str, np.ndarray])
         if 2 * inward.sum() > len(ids):
             raise ValueError(
                 f"normals: those of {int(inward.sum())} of {len(ids)} particles of the group {name!r} point into the "
-                f"domain, first at particle {int(ids[inward.argmax()])}: interior particles lie in front of it; normals "
-                "are outward, turn them round (cloud.replace(normals=-cloud.normals))"
+                f"domain, first at particle {int(ids[inward.argmax()])}: interior particles lie in front of it; "
+                "normals are outward, turn them round (cloud.replace(normals=-cloud.normals))"
             )

@@ -76,8 +76,8 @@ def find_stencils(
         if len(few):
             raise ValueError(
                 f"cloud: {len(few)} particle(s), e.g. particle {few[0]}, see only {counts[few[0]]} of the {needed} "
-                "that a stencil of this order needs, themselves counted: the boundary cuts the others off; add particles to "
-                "that part of the domain, or lower the order"
+                "that a stencil of this order needs, themselves counted: the boundary cuts the others off; add "
+                "particles to that part of the domain, or lower the order"
             )
     return found
 

@@ -9,6 +9,7 @@ import jax
 import numpy as np
 
 from jsmitsm.equation.tracing import Traced
+from jsmitsm.runtime.errors import refuse_masked
 
 
 @jax.tree_util.register_pytree_node_class
@@ -136,6 +137,7 @@ def fix(indices: Any, value: Any, field: int | None = None) -> Condition:
     >>> js.fix([12], 0.0)
     fix(indices=(12,), value=0.0)
     """
+    refuse_masked(indices, "indices")
     index = np.atleast_1d(np.asarray(indices))
     if index.ndim != 1 or index.dtype.kind not in "iu" or not index.size:
         raise ValueError(f"indices: expected particle numbers, got {indices!r}")
@@ -164,6 +166,7 @@ def _value(value: Any, name: str) -> Any:
     """A number, array or function; anything else is refused here, where the user wrote it."""
     if callable(value) or isinstance(value, jax.core.Tracer):
         return value
+    refuse_masked(value, name)
     try:
         array = np.asarray(value)
         if array.dtype.kind not in "fiu":

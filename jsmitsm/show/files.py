@@ -7,7 +7,6 @@ and shapely, ``pip install "jsmitsm[tables]"`` for pandas and xarray. CSV needs 
 from __future__ import annotations
 
 import csv
-import importlib
 import os
 from collections.abc import Mapping
 from typing import Any
@@ -15,16 +14,12 @@ from typing import Any
 import numpy as np
 
 from jsmitsm.cloud.cloud import INTERIOR, Cloud
-from jsmitsm.cloud.mesh_facets import (
-    boundary_normals,
-    check_cells,
-    named_facets,
-    outer_facets,
-    side_normals,
-    volume_cells,
-)
+from jsmitsm.cloud.mesh_facets import Mesh
 from jsmitsm.cloud.shapes import from_polygon
 from jsmitsm.cloud.triangulation import simplices
+from jsmitsm.runtime.errors import refuse_masked
+from jsmitsm.show.mesh_cloud import cloud_of
+from jsmitsm.show.mesh_files import needed, read_mesh
 from jsmitsm.solution.solution import Solution
 
 __all__ = ["from_csv", "from_mesh", "from_shapely", "to_csv", "to_mesh", "to_pandas", "to_xarray"]
@@ -38,24 +33,32 @@ def from_mesh(mesh: Any, tags: str | None = None) -> Cloud:
 
     Parameters
     ----------
-    mesh : a ``meshio.Mesh``, or the path of a file that meshio reads (Gmsh, VTK, Abaqus, XDMF, ...). Lines,
-        triangles and quadrilaterals, tetrahedra, hexahedra, wedges and pyramids, triangles and tetrahedra also of
-        second order. The cells of the highest dimension are the domain; nodes that none of them uses are dropped.
+    mesh : a ``meshio.Mesh``, or the path of a file: SU2 and Abaqus or CalculiX (.inp), what meshio reads besides
+        (Gmsh, VTK, XDMF, ...). Lines, triangles, quadrilaterals, tetrahedra, hexahedra, wedges and pyramids, of
+        first and of second order. The cells of the highest dimension are the domain; nodes that none of them uses are
+        dropped.
     tags : the name of the cell data that hold the groups; found by itself for Gmsh (``gmsh:physical``, names
-        from its physical groups), Medit and others, whose groups are cell sets or point sets.
+        from its physical groups), Medit and others, whose groups are cell sets or point sets. Or a list of the names
+        of groups: those alone, the first first.
 
     Returns
     -------
-    Cloud : groups ``"interior"`` and one for every tag of boundary facets. A node on two of them belongs to the one
-        named first, a boundary node on none to ``"boundary"``. Normals are those of the group's facets, averaged by
-        angle: on curved sides as exact as the facets follow them; ``cloud.replace(normals=...)`` takes better ones.
+    Cloud : groups ``"interior"`` and one for every tag of boundary facets and every set of boundary nodes. A node of
+        several belongs to the one named first, but a set that holds another whole comes after it, and none goes away
+        empty-handed; a boundary node of none belongs to ``"boundary"``. Normals are those of the group's
+        facets, averaged by angle: on curved sides as exact as the facets follow them (those of second order are
+        parabolas); ``cloud.replace(normals=...)`` takes better ones. What has a name and is no side (materials, lines
+        inside, sets that reach inside) is in ``cloud.cell_groups``: indices by name, which may overlap.
 
     Raises
     ------
     ImportError
         Where a path is given and meshio is missing: ``pip install "jsmitsm[mesh]"``.
     ValueError
-        For a mesh without cells, a surface in space, an unknown kind of cell, or tags that do not exist.
+        For a mesh without cells, a surface in space, parts of several dimensions, an unknown kind of cell; for cells
+        without volume, with crossing sides, folded or overlapping; for hanging nodes and nodes that were not merged;
+        for a domain that touches itself in a point or an edge; for a group without a node of its own, and tags that do
+        not exist or name nothing. Which way round the nodes of a cell run does not matter.
 
     >>> import meshio, numpy as np, jsmitsm as js
     >>> corners = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0.5, 0.5, 0]]
@@ -63,100 +66,22 @@ def from_mesh(mesh: Any, tags: str | None = None) -> Cloud:
     ...                              ("line", [[0, 1], [1, 2]])], cell_data={"gmsh:physical": [[7] * 4, [1, 2]]},
     ...                    field_data={"bottom": np.array([1, 1]), "side": np.array([2, 1])})
     >>> js.files.from_mesh(mesh)
-    Cloud(5 particles in 2D, groups {interior: 1, bottom: 2, side: 1, boundary: 1})
+    Cloud(5 particles in 2D, groups {interior: 1, bottom: 2, side: 1, boundary: 1}, cell groups {7: 5})
     """
     if isinstance(mesh, (str, os.PathLike)):
-        mesh = _read(mesh)
-    if not (hasattr(mesh, "points") and hasattr(mesh, "cells")):
+        mesh = read_mesh(mesh)
+    if not all(hasattr(mesh, name) for name in Mesh._fields):
         raise ValueError(f"mesh: expected a meshio.Mesh or the path of a mesh file, got {type(mesh).__name__}")
-    dim, cells = volume_cells(mesh.cells)
-    points = _checked_nodes(mesh.points, dim)
-    check_cells(len(points), cells)
-    size = np.ptp(points, axis=0).max()
-    if points.shape[1] > dim and np.ptp(points[:, dim:], axis=0).max() > 1e-12 * size:
-        raise ValueError(
-            f"mesh: its cells are {dim}-dimensional but its points are not in the first {dim} axes; "
-            "a surface in space is no domain, mesh the volume"
-        )
-    used = np.unique(np.concatenate([block.ravel() for _, block in cells]))
-    new = np.full(len(points), -1)
-    new[used] = np.arange(len(used))
-    points = np.ascontiguousarray(points[used, :dim])
-    # Products of coordinates must neither overflow nor vanish: the geometry is found in units of its size.
-    unit = float(np.ptp(points, axis=0).max()) or 1.0
-    corner = points.min(axis=0)
-    cells = [(kind, new[block]) for kind, block in cells]
-    scaled = (points - corner) / unit
-    outer = outer_facets(scaled, cells)
-    normals = boundary_normals(scaled, outer)
-    free = np.isfinite(normals[:, 0])
-    groups = {INTERIOR: np.flatnonzero(~free)}
-    for name, nodes in named_facets(mesh, dim, tags).items():
-        nodes = new[nodes]
-        nodes = np.unique(nodes[nodes >= 0])
-        claimed = nodes[free[nodes]]  # tags inside of the domain are no boundary
-        if len(claimed):
-            if name == INTERIOR:
-                raise ValueError(f"mesh: boundary facets are tagged {INTERIOR!r}, the name of what lies inside; rename")
-            groups[name] = claimed
-            free[claimed] = False
-            members = np.zeros(len(points), bool)
-            members[nodes] = True
-            # At a corner between groups the normal is that of the own side: what is said of a side holds to its end.
-            own = side_normals(scaled, outer, members)[claimed]
-            normals[claimed] = np.where(np.isfinite(own), own, normals[claimed])
-    if free.any():
-        groups["boundary"] = np.union1d(groups.get("boundary", np.zeros(0, int)), np.flatnonzero(free))
-    return Cloud(points, groups, normals)
+    return cloud_of(mesh, *_tag_key(tags))
 
 
-def _checked_nodes(points: Any, dim: int) -> np.ndarray:
-    """The nodes of a mesh (N, D), real and finite, in at least as many axes as its cells have."""
-    array = np.asarray(points)
-    if array.dtype.kind not in "iuf" or array.ndim != 2 or array.shape[1] < dim:
-        raise ValueError(
-            f"mesh: its points have shape {array.shape} and type {array.dtype}; expected real numbers (N, D), D at "
-            f"least {dim} for its cells"
-        )
-    bad = np.flatnonzero(~np.isfinite(array).all(axis=1))
-    if len(bad):
-        raise ValueError(f"mesh: NaN or infinite coordinates at the points {bad[:5].tolist()}; remove or mend them")
-    return array.astype(np.float64)
-
-
-def _read(path: Any) -> Any:
-    """The mesh in a file; whatever meshio does with one that is damaged, which may be to end the program."""
-    meshio = _needed("meshio", "mesh")
-    if not os.path.isfile(path):
-        raise ValueError(f"mesh: there is no file {os.fspath(path)!r}; give the path of a mesh file")
-    with open(path, "rb") as file:
-        start = file.read(1)
-        file.seek(-min(os.path.getsize(path), 100), os.SEEK_END)
-        end = file.read().split()
-        if os.fspath(path).endswith((".node", ".ele")):  # comments alone are nothing either
-            file.seek(0)
-            end = [line for line in file if not line.strip().startswith(b"#") and line.strip()]
-    kind = {b"$": "gmsh", b"(": "ansys"}.get(start) if os.fspath(path).endswith(".msh") else None
-    # Of such a file that ends too soon, or is of neither kind, meshio would look for the end for ever.
-    whole = end and (end[-1].startswith(b"$End") if kind == "gmsh" else end[-1].endswith(b")") or kind != "ansys")
-    if not whole:
-        raise ValueError(f"mesh: the file {os.fspath(path)!r} is {'cut short' if end else 'empty'}; write it again")
-    if kind is None and os.fspath(path).endswith(".msh"):
-        raise ValueError(
-            f"mesh: the file {os.fspath(path)!r} is of neither kind of .msh, Gmsh's or Ansys's; convert it"
-        )
-    try:
-        return meshio.read(path, kind)
-    except ModuleNotFoundError as error:
-        raise ImportError(
-            f"mesh: meshio needs {error.name} for {os.fspath(path)!r}: pip install {error.name}"
-        ) from None
-    except (Exception, SystemExit) as error:
-        what = f"{type(error).__name__}: {error}".strip(": ")
-        raise ValueError(
-            f"mesh: meshio cannot read {os.fspath(path)!r} ({what}); expected a whole file of a format that its "
-            "extension names (.msh, .vtk, .vtu, .inp, .xdmf, ...)"
-        ) from error
+def _tag_key(tags: Any) -> tuple[str | None, list[str] | None]:
+    """The cell data that hold the groups, or the groups themselves."""
+    if tags is None or isinstance(tags, str):
+        return tags, None
+    if isinstance(tags, (list, tuple)) and tags and all(isinstance(name, str) for name in tags):
+        return None, list(tags)
+    raise ValueError(f"tags: expected the name of cell data, or a list of the names of groups, got {tags!r}")
 
 
 def from_shapely(polygon: Any, spacing: Any, seed: int = 0, groups: Any = None) -> Cloud:
@@ -171,7 +96,7 @@ def from_shapely(polygon: Any, spacing: Any, seed: int = 0, groups: Any = None) 
     ['boundary', 'hole0', 'interior']
     """
     if isinstance(polygon, str):
-        shapely, text = _needed("shapely", "mesh"), polygon
+        shapely, text = needed("shapely", "mesh"), polygon
         try:
             polygon = shapely.from_wkt(text)
         except shapely.errors.ShapelyError as error:
@@ -191,7 +116,8 @@ def from_csv(path: Any) -> Cloud:
     """A cloud from a CSV file with a header: columns ``x`` (``y``, ``z``) and ``group``; normals in ``nx`` (``ny``,
     ``nz``) where there are any, empty in the interior. Other columns are ignored. :func:`to_csv` writes such files.
 
-    Raises ValueError for a missing column or a cell that is no number, with its line. ``path``: a name or a path.
+    Raises ValueError for a column that is missing or comes twice, and a cell that is no number, with its line.
+    ``path``: a name or a path.
 
     >>> import os, tempfile, jsmitsm as js
     >>> path = os.path.join(tempfile.mkdtemp(), "cloud.csv")
@@ -200,38 +126,62 @@ def from_csv(path: Any) -> Cloud:
     Cloud(3 particles in 1D, groups {interior: 1, left: 1, right: 1})
     """
     try:
-        with open(path, newline="", encoding="utf-8-sig") as file:
-            rows = list(csv.DictReader(file, skipinitialspace=True))
-    except (OSError, TypeError) as error:
-        raise ValueError(f"path: cannot read {path!r} ({error}); give the path of a CSV file") from None
+        with open(_a_path(path), newline="", encoding="utf-8-sig") as file:
+            reader = csv.reader(file, skipinitialspace=True, strict=True)
+            lines = [(reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]
     except (UnicodeDecodeError, csv.Error) as error:
         raise ValueError(f"path: {path} is no text in UTF-8 ({error}); save it as CSV in UTF-8") from None
-    if not rows:
+    except (OSError, ValueError) as error:
+        raise ValueError(f"path: cannot read {path!r} ({error}); give the path of a CSV file") from None
+    if len(lines) < 2:
         raise ValueError(f"path: {path} has no rows below its header")
-    axes = [name for name in _AXES if name in rows[0]]
-    if "group" not in rows[0] or "".join(axes) not in ("x", "xy", "xyz"):
-        raise ValueError(f"path: {path} has the columns {list(rows[0])}; expected x (and y, z) and group")
-    points = _numbers(rows, axes, path)
-    names = [(row["group"] or "").strip() for row in rows]
-    if "" in names:
-        raise ValueError(f"path: {path}, line {names.index('') + 2}: has no group; expected {INTERIOR} or a name")
-    groups = {name: np.flatnonzero([n == name for n in names]) for name in dict.fromkeys([INTERIOR, *names])}
+    header = [name.strip() for name in lines[0][1]]
+    axes = [name for name in _AXES if name in header]
     normals = [f"n{name}" for name in axes]
-    return Cloud(points, groups, _numbers(rows, normals, path) if normals[0] in rows[0] else None)
+    if "group" not in header or "".join(axes) not in ("x", "xy", "xyz"):
+        raise ValueError(f"path: {path} has the columns {header}; expected x (and y, z) and group")
+    twice = [name for name in dict.fromkeys(header) if header.count(name) > 1 and name in (*axes, *normals, "group")]
+    if twice:
+        raise ValueError(f"path: {path} has several columns of the name {twice[0]!r}; keep one")
+    if 0 < sum(name in header for name in normals) < len(axes):
+        raise ValueError(f"path: {path} has the columns {header}; expected all of {normals} for normals, or none")
+    for line, row in lines:
+        if any(cell.strip() for cell in row[len(header) :]):
+            raise ValueError(
+                f"path: {path}, line {line}: has {len(row)} cells under {len(header)} columns; write one under each, "
+                "numbers with a point"
+            )
+    rows = [(line, dict(zip(header, row))) for line, row in lines[1:]]
+    points = _numbers(rows, axes, path)
+    names = [row.get("group", "").strip() for _, row in rows]
+    for (line, _), name in zip(rows, names):
+        if not name or (name != INTERIOR and name.lower() == INTERIOR):
+            raise ValueError(
+                f"path: {path}, line {line}: has {f'the group {name!r}' if name else 'no group'}; expected "
+                f"{INTERIOR} or the name of a side"
+            )
+    groups = {name: np.flatnonzero([n == name for n in names]) for name in dict.fromkeys([INTERIOR, *names])}
+    return Cloud(points, groups, _numbers(rows, normals, path) if normals[0] in header else None)
 
 
 def to_csv(what: Cloud | Solution, path: Any) -> None:
     """Write a cloud, or a solution with its cloud, as CSV: coordinates, group, normals and the values ``u``.
 
     ``what``: a cloud or a solution; ``path``: a name or a path. Numbers are written so that they read back to the
-    last bit, see :func:`from_csv`.
+    last bit, see :func:`from_csv`; cell groups are not written.
     """
     columns = _columns(_a_kind(what, (Cloud, Solution), "what"))
-    with open(path, "w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(columns)
-        for row in zip(*columns.values()):
-            writer.writerow(["" if v != v else v if isinstance(v, str) else repr(float(v)) for v in row])
+    for name in set(columns["group"]):
+        if name != name.strip() or not name or (name != INTERIOR and name.lower() == INTERIOR):
+            raise ValueError(f"what: the name {name!r} of a group would not read back from CSV; rename the group")
+    try:
+        with open(_a_path(path), "w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file)
+            writer.writerow(columns)
+            for row in zip(*columns.values()):
+                writer.writerow(["" if v != v else v if isinstance(v, str) else repr(float(v)) for v in row])
+    except OSError as error:
+        raise ValueError(f"path: cannot write {path!r} ({error}); give the path of a file in a folder") from None
 
 
 def to_mesh(sol: Solution, **more: Any) -> Any:
@@ -248,7 +198,7 @@ def to_mesh(sol: Solution, **more: Any) -> Any:
     >>> js.files.to_mesh(sol).point_data["u"].shape
     (9,)
     """
-    meshio = _needed("meshio", "mesh")
+    meshio = needed("meshio", "mesh")
     cloud = _a_kind(sol, (Solution,), "sol").cloud
     points = np.zeros((len(cloud), 3))
     points[:, : cloud.dim] = cloud.points
@@ -267,7 +217,7 @@ def to_pandas(what: Cloud | Solution, **more: Any) -> Any:
     ['left', 'interior', 'right']
     """
     columns = _columns(_a_kind(what, (Cloud, Solution), "what"))
-    return _needed("pandas", "tables").DataFrame({**columns, **_per_particle(more, len(columns["x"]), (1,), columns)})
+    return needed("pandas", "tables").DataFrame({**columns, **_per_particle(more, len(columns["x"]), (1,), columns)})
 
 
 def to_xarray(sol: Solution, **more: Any) -> Any:
@@ -283,7 +233,7 @@ def to_xarray(sol: Solution, **more: Any) -> Any:
     >>> js.files.to_xarray(sol).u.sizes["particle"]
     9
     """
-    xarray = _needed("xarray", "tables")
+    xarray = needed("xarray", "tables")
     columns = _columns(_a_kind(sol, (Solution,), "sol").cloud)
     more = _per_particle(more, len(sol.cloud), (1,), columns)
     dims = ("particle", "field")[: np.ndim(sol.u)]
@@ -292,14 +242,6 @@ def to_xarray(sol: Solution, **more: Any) -> Any:
         coords={name: ("particle", column) for name, column in columns.items()},
         attrs={"method": sol.method, "order": sol.order, "converged": int(bool(sol.converged))},
     )
-
-
-def _needed(name: str, extra: str) -> Any:
-    """An optional library, or an error that names its extra."""
-    try:
-        return importlib.import_module(name)
-    except ImportError:
-        raise ImportError(f'{name} is needed here, an optional extra: pip install "jsmitsm[{extra}]"') from None
 
 
 def _a_kind(what: Any, kinds: tuple[type, ...], name: str) -> Any:
@@ -316,10 +258,12 @@ def _per_particle(more: Mapping[str, Any], count: int, dims: tuple[int, ...], ta
     """Further columns as arrays with a row for every particle."""
     out = {}
     for name, value in more.items():
+        refuse_masked(value, name)
         array = np.asarray(value)
         if array.ndim not in dims or len(array) != count or array.dtype.kind == "O":
+            what = " of Python's objects (missing values?)" if array.dtype.kind == "O" and array.ndim else ""
             raise ValueError(
-                f"{name}: values of shape {array.shape} came, expected {count}, one per particle"
+                f"{name}: values of shape {array.shape} came{what}, expected {count}, one per particle"
                 + (", or rows of them" if 2 in dims else "")
             )
         if name in taken:
@@ -344,14 +288,23 @@ def _columns(what: Cloud | Solution) -> Mapping[str, np.ndarray]:
     return columns
 
 
-def _numbers(rows: list[dict[str, str]], names: list[str], path: Any) -> np.ndarray:
+def _numbers(rows: list[tuple[int, dict[str, str]]], names: list[str], path: Any) -> np.ndarray:
     """Columns of a table (N, len(names)); an empty cell is NaN."""
     table = np.empty((len(rows), len(names)))
-    for i, row in enumerate(rows):
+    for i, (line, row) in enumerate(rows):
         for k, name in enumerate(names):
-            cell = row.get(name)
+            cell = row.get(name, "").strip()
             try:
+                if "_" in cell:  # 1_000 is a number of Python's alone
+                    raise ValueError
                 table[i, k] = float(cell) if cell else np.nan
             except ValueError:
-                raise ValueError(f"path: {path}, line {i + 2}: {name} = {cell!r} is no number") from None
+                raise ValueError(f"path: {path}, line {line}: {name} = {cell!r} is no number") from None
     return table
+
+
+def _a_path(path: Any) -> Any:
+    """``path``, or an error: a number would be taken for an open file of the program's."""
+    if not isinstance(path, (str, bytes, os.PathLike)):
+        raise ValueError(f"path: cannot read or write {path!r}, a {type(path).__name__}; give the path of a CSV file")
+    return path

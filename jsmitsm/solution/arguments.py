@@ -12,6 +12,7 @@ from jsmitsm.discretization.layout import Discretization, discretize
 from jsmitsm.equation.problem import Problem
 from jsmitsm.linear.linsolve import SOLVERS
 from jsmitsm.particle.kernels import Kernel
+from jsmitsm.runtime.errors import refuse_masked
 from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.taylor.multi_indices import HIGHEST
 
@@ -62,6 +63,7 @@ def _check_start(u0: Any, shape: tuple[int, int]) -> None:
     """A start for Newton's method: nothing, a function, or finite values of the right shape."""
     if u0 is None or callable(u0) or is_traced(u0):
         return
+    refuse_masked(u0, "u0")
     try:
         if np.iscomplexobj(u0):
             raise TypeError

@@ -12,6 +12,7 @@ import numpy as np
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.cloud.inside import inside_of
 from jsmitsm.particle.polynomials import derivative_table, monomials
+from jsmitsm.runtime.errors import refuse_masked
 from jsmitsm.runtime.tracers import is_traced
 
 OUTSIDE = ("nan", "extrapolate", "raise")
@@ -46,6 +47,7 @@ def in_domain(cloud: Cloud, points: Any, outside: str) -> Any:
 
 def checked_points(points: Any, dim: int) -> Any:
     if not is_traced(points):
+        refuse_masked(points, "points")
         try:
             if np.iscomplexobj(points):
                 raise TypeError
