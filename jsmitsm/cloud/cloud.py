@@ -28,6 +28,11 @@ class Groups(Mapping[str, np.ndarray]):
             self._groups[name] = index
         self._key = tuple((name, index.tobytes()) for name, index in self._groups.items())
 
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        for index in self._groups.values():
+            index.setflags(write=False)
+
     def __getitem__(self, name: str) -> np.ndarray:
         return self._groups[name]
 

@@ -23,7 +23,8 @@ def closed(problem: Problem, traced: Traced) -> Problem:
     if problem.pde is traced:
         return problem
     new = object.__new__(Problem)
-    new.pde, new.fields, new.params = traced, problem.fields, jax.tree.map(owned, problem.params)
+    new.fields, new.params = problem.fields, jax.tree.map(owned, problem.params)
+    new.pde = traced  # type: ignore[assignment]
     new.bcs = {
         name: [_closed_condition(problem, c, traced.dim, f"bcs[{name!r}]") for c in conditions]
         for name, conditions in problem.bcs.items()

@@ -244,9 +244,9 @@ def _component(problem: Problem, points: Any, value: Any, named: int | None, k: 
 
 def sample(function: Callable[..., Any] | Traced, points: Any, params: Any, components: int, where: str) -> Any:
     """A user's function of x, or its record, at all points: (components, n)."""
-    recorded = isinstance(function, Traced)
-    traced = function if recorded else recorded_values(function, points.shape[1], params, components, where)
-    _, values = traced.coefficients(points, 0, params=params)
+    if not isinstance(function, Traced):
+        function = recorded_values(function, points.shape[1], params, components, where)
+    _, values = function.coefficients(points, 0, params=params)
     n = points.shape[0]
     if values is None:
         return np.zeros((components, n))

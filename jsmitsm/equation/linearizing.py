@@ -354,8 +354,8 @@ def record(
         invars=jaxpr.invars[: len(jaxpr.invars) - n],
     )
     # What the residual closes over may be changed in place later: a record holds copies.
-    consts = tuple(map(owned, (*third.consts, *first.consts)))
-    return Record(jaxpr, consts, ordered, tuple(outputs), flat.outvars[0].aval.shape[0])
+    kept = tuple(map(owned, (*third.consts, *first.consts)))
+    return Record(jaxpr, kept, ordered, tuple(outputs), flat.outvars[0].aval.shape[0])
 
 
 def _shaped(v: Any) -> jax.ShapeDtypeStruct:

@@ -69,7 +69,7 @@ def nearest_particles(cloud: Cloud, points: Any, count: int) -> tuple[Any, Any]:
     count, domain = min(count, centres.shape[0]), None if is_traced(centres, points) else inside_of(cloud)
     if domain is None:
         square = jnp.sum((jax.lax.stop_gradient(points)[:, None] - jax.lax.stop_gradient(centres)[None]) ** 2, axis=2)
-        index = jax.lax.top_k(-square, count)[1]
+        index: Any = jax.lax.top_k(-square, count)[1]
     else:
         index = domain.nearest(points, count)
     if count == 1:
