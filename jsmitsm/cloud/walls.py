@@ -34,11 +34,15 @@ _SIDED = 0.35
 class Walls:
     """The boundary as obstacles among the particles ``points`` (M, D).
 
-    ids (W,): boundary particles; normals (W, D): outward, NaN where they are to be fitted. interior (M,): a mask.
+    ids (W,): boundary particles; normals (W, D): outward, NaN where they are to be fitted. interior (M,): a mask;
+    groups: the names of the boundary particles, for messages.
     """
 
-    def __init__(self, points: np.ndarray, ids: np.ndarray, normals: np.ndarray, interior: np.ndarray):
-        self.points, self.ids, self.interior = points, ids, interior
+    def __init__(
+        self, points: np.ndarray, ids: np.ndarray, normals: np.ndarray, interior: np.ndarray,
+        groups: dict[str, np.ndarray],
+    ):  # fmt: skip
+        self.points, self.ids, self.interior, self.groups = points, ids, interior, groups
         self.given = normals
         self.place = np.full(len(points), -1)
         self.place[ids] = np.arange(len(ids))
@@ -48,6 +52,8 @@ class Walls:
         if not len(self.ids):
             return None
         whole = len(rows) == len(self.points)
+        if whole:
+            self.check_outward(near)
         walls = self.ids if whole else np.unique(near[(near >= 0) & (self.place[near] >= 0)])
         if not len(walls):
             return None
@@ -63,6 +69,9 @@ class Walls:
             return None
         out = np.zeros(near.shape, bool)
         out[suspects] = self._behind(near[suspects], rows[suspects])
+        if not np.isfinite(self.given).all():
+            # Whom fitted normals cut off from everybody, they misjudge.
+            out[((near >= 0) & ~out).sum(axis=1) <= self.points.shape[1] + 1] = False
         return out if out.any() else None
 
     def _nearest(self, ids: np.ndarray, count: int) -> np.ndarray:
@@ -133,6 +142,31 @@ class Walls:
         out = np.full(self.points.shape, np.nan)
         out[self.ids] = self._normals(self.ids) if len(self.ids) else out[self.ids]
         return out
+
+    def check_outward(self, table: np.ndarray) -> None:
+        """Refuse a group most of whose normals point to the interior particles: ValueError.
+
+        table (M, w): the neighbours of all particles, hidden ones too.
+        """
+        for name, ids in self.groups.items():
+            normal = self.given[self.place[ids]] if len(ids) else np.zeros((0, 1))
+            ids, normal = (x[np.isfinite(normal).all(axis=1)] for x in (ids, normal))
+            if not len(ids):
+                continue
+            near = table[ids]
+            inner = (near >= 0) & self.interior[near]
+            offset = self.points[np.maximum(near, 0)] - self.points[ids][:, None]
+            length = np.where(inner, np.linalg.norm(offset, axis=2), 1.0)
+            weight = np.where(inner, (length.min(axis=1, where=inner, initial=np.inf)[:, None] / length) ** 4, 0.0)
+            height = np.einsum("bkd,bd->bk", offset, normal) / length
+            mean = (weight * height).sum(axis=1) / np.maximum(weight.sum(axis=1), 1e-300)
+            inward = mean > 0.3
+            if 2 * inward.sum() > len(ids):
+                raise ValueError(
+                    f"normals: those of {int(inward.sum())} of {len(ids)} particles of the group {name!r} point into "
+                    f"the domain, first at particle {int(ids[inward.argmax()])}: interior particles lie in front of it; "
+                    "normals are outward, turn them round (cloud.replace(normals=-cloud.normals))"
+                )
 
     # -- what is seen
 
@@ -282,29 +316,3 @@ def _tree(points: np.ndarray) -> Any:
     from scipy.spatial import cKDTree
 
     return cKDTree(points)
-
-
-def check_outward(walls: Walls, table: np.ndarray, names: dict[str, np.ndarray]) -> None:
-    """Refuse a group most of whose normals point to the interior particles: ValueError.
-
-    table (M, w): the neighbours of all particles; names: the boundary groups.
-    """
-    for name, ids in names.items():
-        normal = walls.given[walls.place[ids]] if len(ids) else np.zeros((0, 1))
-        ids, normal = (x[np.isfinite(normal).all(axis=1)] for x in (ids, normal))
-        if not len(ids):
-            continue
-        near = table[ids]
-        inner = (near >= 0) & walls.interior[near]
-        offset = walls.points[np.maximum(near, 0)] - walls.points[ids][:, None]
-        length = np.where(inner, np.linalg.norm(offset, axis=2), 1.0)
-        weight = np.where(inner, (length.min(axis=1, where=inner, initial=np.inf)[:, None] / length) ** 4, 0.0)
-        height = np.einsum("bkd,bd->bk", offset, normal) / length
-        mean = (weight * height).sum(axis=1) / np.maximum(weight.sum(axis=1), 1e-300)
-        inward = mean > 0.3
-        if 2 * inward.sum() > len(ids):
-            raise ValueError(
-                f"normals: those of {int(inward.sum())} of {len(ids)} particles of the group {name!r} point into the "
-                f"domain, first at particle {int(ids[inward.argmax()])}: interior particles lie in front of it; "
-                "normals are outward, turn them round (cloud.replace(normals=-cloud.normals))"
-            )

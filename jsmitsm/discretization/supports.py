@@ -9,7 +9,7 @@ import numpy as np
 
 from jsmitsm.cloud.cloud import INTERIOR, Cloud
 from jsmitsm.cloud.neighbours import Stencils, evenly_spaced, in_line, jumps, replaced, within
-from jsmitsm.cloud.walls import Walls, check_outward, nearest_seen, within_seen
+from jsmitsm.cloud.walls import Walls, nearest_seen, within_seen
 from jsmitsm.discretization.periodic import Images
 from jsmitsm.equation.problem import Problem
 from jsmitsm.particle.elimination import Scheme
@@ -58,7 +58,8 @@ def walls_of(problem: Problem, cloud: Cloud, images: Images) -> Walls | None:
         wall[ids] = name != INTERIOR and name not in open_
     given = np.full((n, cloud.dim), np.nan) if normals is None else np.asarray(normals, float)
     ids = np.flatnonzero(images.extend_values(wall))
-    return Walls(points, ids, images.extend_values(given)[ids], images.extend_values(interior))
+    groups = {name: members[wall[members]] for name, members in cloud.groups.items() if name != INTERIOR}
+    return Walls(points, ids, images.extend_values(given)[ids], images.extend_values(interior), groups)
 
 
 def find_stencils(
@@ -66,9 +67,8 @@ def find_stencils(
 ) -> Stencils:
     """Neighbours that each particle sees, see :mod:`jsmitsm.cloud.walls`; outward normals are checked by the way."""
     found = _found_stencils(cloud, kernel, scheme, images, conditioned, walls)
-    if walls is not None:
-        names = {name: ids[walls.place[ids] >= 0] for name, ids in cloud.groups.items() if name != INTERIOR}
-        check_outward(walls, np.asarray(found.indices), names)
+    if walls is not None and cloud.dim == 1:
+        walls.check_outward(np.asarray(found.indices))
     if walls is not None and kernel is None:
         counts = (np.asarray(found.indices) >= 0).sum(axis=1)
         needed = scheme_size(scheme) + 1
