@@ -65,8 +65,8 @@ def main() -> None:
             rows.append([name, *(f"{statistics.median(r[k] for r in runs):.2f}" for k in (0, 1))])
             print(rows[-1], flush=True)
     note = (
-        f"Seconds of a fresh process to the first solution (1024 scattered particles, order 4), medians of {REPEATS} on "
-        f"{about['cores']} cores of {about['processor']} (`python -m benchmarks.cold`)."
+        f"Seconds of a fresh process to the first solution (1024 scattered particles, order 4), medians of {REPEATS} "
+        f"on {about['cores']} cores of {about['processor']} (`python -m benchmarks.cold`)."
     )
     made = {"columns": ["", "importing jax", "from there to the solution"], "rows": rows, "note": note}
     DATA.write_text(json.dumps({"machine": about, "runs": found, "tables": {"cold": made}}, indent=1) + "\n")

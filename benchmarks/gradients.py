@@ -136,14 +136,15 @@ def main() -> None:
             ])  # fmt: skip
             print(rows[-1], flush=True)
     callbacks = sum(found["callbacks"] for found in results)
-    columns = ["particles", "with respect to", "first call (s)", "programs", "forward (s)", "value_and_grad (s)", "ratio"]
+    columns = ["particles", "with respect to", "first call (s)", "programs", "forward (s)", "value_and_grad (s)"]
     note = (
         f"Plain `jax.value_and_grad` of a Poisson problem, method S of order 4, medians of {REPEATS} calls in turn on "
-        f"{about['cores']} cores of {about['processor']} (`python -m benchmarks.gradients`). programs: compiled at the first "
-        "call, each set of parameters after the one above; ratio: median over the calls, to the forward solve before each; "
-        f"memory: peak of a process with gradients over that of one with forward solves. Callbacks emitted: {callbacks}."
+        f"{about['cores']} cores of {about['processor']} (`python -m benchmarks.gradients`). programs: compiled at the "
+        "first call, each set of parameters after the one above; ratio: median over the calls, to the forward solve "
+        "before each; memory: peak of a process with gradients over that of one with forward solves. "
+        f"Callbacks emitted: {callbacks}."
     )
-    made = {"columns": [*columns, "factorisations", "memory"], "rows": rows, "note": note}
+    made = {"columns": [*columns, "ratio", "factorisations", "memory"], "rows": rows, "note": note}
     DATA.write_text(json.dumps({"machine": about, "results": results, "tables": {"gradients": made}}, indent=1) + "\n")
 
 

@@ -1,8 +1,8 @@
 """The local phase, microseconds a particle: ``python -m benchmarks.local``.
 
-One small system for every particle: support, moments, weights, no neighbour search and no assembly. On one core, and in
-pieces side by side on all of them, as it is solved; the same as the many kernels that XLA makes of it by itself; and for
-a variable operator against its constant twin.
+One small system for every particle: support, moments, weights, no neighbour search and no assembly. On one core, and
+in pieces side by side on all of them, as it is solved; the same as the many kernels that XLA makes of it by itself; and
+for a variable operator against its constant twin.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ import jax.numpy as jnp
 import jsmitsm as js
 from benchmarks import machine
 from benchmarks.commandline import arguments
-from jsmitsm.discretization.rows import all_rows
 from jsmitsm.discretization.coefficients import numbers
+from jsmitsm.discretization.rows import all_rows
 from jsmitsm.runtime import one_kernel
 from jsmitsm.solution.arguments import discretized
 
@@ -70,7 +70,8 @@ def apart(case: tuple[int, ...], cores: set[int], variable: bool = False, many: 
     mine = os.sched_getaffinity(0)
     os.sched_setaffinity(0, cores)  # a process starts on the cores of its parent
     try:
-        command = [sys.executable, "-m", "benchmarks.local", "--one", *map(str, case), str(int(variable)), str(int(many))]
+        numbers = map(str, (*case, int(variable), int(many)))
+        command = [sys.executable, "-m", "benchmarks.local", "--one", *numbers]
         done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=Path(__file__).parent.parent)
     finally:
         os.sched_setaffinity(0, mine)
@@ -94,8 +95,8 @@ def main() -> None:
         f"of its own, on {about['processor']} (`python -m benchmarks.local`)."
     )
     all_cores = f"{about['cores']} cores"
-    columns = ["", "order", "neighbours", "one core", all_cores, "gain", "many kernels, one core", f"many kernels, {all_cores}"]
-    columns += ["variable coefficients, one core", "ratio"]
+    columns = ["", "order", "neighbours", "one core", all_cores, "gain"]
+    columns += ["many kernels, one core", f"many kernels, {all_cores}", "variable coefficients, one core", "ratio"]
     made = {"columns": columns, "rows": lines, "note": note}
     DATA.write_text(json.dumps({"machine": about, "tables": {"local": made}}, indent=1) + "\n")
 

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
+
 from benchmarks import machine
 from benchmarks.commandline import arguments
 from benchmarks.problems import CASES

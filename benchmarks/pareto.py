@@ -2,10 +2,11 @@
 
 Every method and order of the package, and other discretisations where they are installed
 (``pip install ".[bench]"``; updes, which brings Gmsh and pandas along, by ``pip install updes``), on
-four scenes. ``--only=updes`` runs the contestants of that name and keeps the data of the others. Seconds are from arrays to values: neighbours,
-weights, assembly, solve. The first call, which compiles, stands apart from the median of the
-repeats; every repeat has its particles moved by a trifle, so that no factor is used again. The
-package differentiates its sources itself; the others get their numbers for nothing.
+four scenes. ``--only=updes`` runs the contestants of that name and keeps the data of the others.
+Seconds are from arrays to values: neighbours, weights, assembly, solve. The first call, which
+compiles, stands apart from the median of the repeats; every repeat has its particles moved by a
+trifle, so that no factor is used again. The package differentiates its sources itself; the others
+get their numbers for nothing.
 """
 
 from __future__ import annotations
@@ -106,7 +107,8 @@ def posed(scene: Scene, cloud: js.Cloud, size: Any) -> peers.Posed:
     def functions(places):
         places = jnp.asarray(places)
         source = jax.vmap(lambda x: scene.case.operator(scene.exact, x))(places)
-        return tuple(np.array(v) for v in (source, _everywhere(scene.conductivity, places), jax.vmap(scene.exact)(places)))
+        values = source, _everywhere(scene.conductivity, places), jax.vmap(scene.exact)(places)
+        return tuple(np.array(v) for v in values)
 
     points = np.asarray(cloud.points)
     source, conductivity, values = functions(points)
@@ -184,12 +186,13 @@ def everyone(scene: Scene) -> Iterator[tuple[str, Any]]:
         yield f"S {order}", ours("S", order)
     for method in ("I", "II", "III", "SSPH"):
         yield f"{method} 4", ours(method, 4)
+    flat = scene.name != "ball"
     for name, make in (
         ("rbf 2", lambda: peers.rbf(2)), ("rbf 4", lambda: peers.rbf(4)), ("rbf 6", lambda: peers.rbf(6)),
         ("gfdm 4", lambda: peers.gfdm),
-        *([("P1", lambda: peers.elements(1)), ("P2", lambda: peers.elements(2))] if scene.name != "ball" else []),
+        *([("P1", lambda: peers.elements(1)), ("P2", lambda: peers.elements(2))] if flat else []),
         *([("9-point", lambda: peers.compact), ("findiff 4", lambda: peers.differences(4))] if scene.lattice else []),
-        *([("updes r3", lambda: peers.dense(3, 1)), ("updes r7", lambda: peers.dense(7, 3))] if scene.name != "ball" else []),
+        *([("updes r3", lambda: peers.dense(3, 1)), ("updes r7", lambda: peers.dense(7, 3))] if flat else []),
     ):  # fmt: skip
         try:
             yield name, theirs(make())
@@ -234,7 +237,8 @@ def raced(scene: Scene, quick: bool, only: str) -> list[dict[str, Any]]:
             shown = line["warm"] if line["warm"] is not None else math.nan
             print(f"{name:10}{line['particles']:8d}{line['error']:10.1e}{line['first']:9.3f}{shown:9.4f}", flush=True)
             slow = line["warm"] or line["first"]
-            if slow > PATIENCE / 2 or line["first"] > 2.5 * PATIENCE or (name.split()[0] in ("I", "II", "III", "SSPH") and slow > 1.0):
+            rival = name.split()[0] in ("I", "II", "III", "SSPH")
+            if slow > PATIENCE / 2 or line["first"] > 2.5 * PATIENCE or (rival and slow > 1.0):
                 break
     return lines
 
@@ -257,7 +261,8 @@ def table(lines: list[dict[str, Any]], about: dict[str, Any]) -> dict[str, Any]:
             best = [quickest(lines, scene, 10.0**-digits, ours) for ours in (True, False)]
             if best[0] is not None:
                 cells = [
-                    "-" if b is None else f"{1e3 * b['warm']:.3g} ms ({b['name']}, {b['particles']} particles)" for b in best
+                    "-" if b is None else f"{1e3 * b['warm']:.3g} ms ({b['name']}, {b['particles']} particles)"
+                    for b in best
                 ]
                 ratio = f"{best[1]['warm'] / best[0]['warm']:.1f}" if best[1] else "-"
                 rows.append([scene, f"1e-{digits}", *cells, ratio])

@@ -10,8 +10,6 @@ import time
 from pathlib import Path
 
 import jax
-
-jax.config.update("jax_enable_x64", True)
 import numpy as np
 
 import jsmitsm as js
@@ -19,10 +17,10 @@ from benchmarks import stability as st
 from benchmarks.commandline import arguments
 from benchmarks.machine import describe
 from benchmarks.problems.families import at_home, smooth
-from jsmitsm.discretization.rows import all_rows
-from jsmitsm.discretization.layout import discretize
-from jsmitsm.discretization.coefficients import numbers
 from jsmitsm.discretization import health
+from jsmitsm.discretization.coefficients import numbers
+from jsmitsm.discretization.layout import discretize
+from jsmitsm.discretization.rows import all_rows
 
 DATA = Path(__file__).parent / "data" / "repair.json"
 
@@ -89,6 +87,7 @@ def cost(n=200):
 
 
 def main():
+    jax.config.update("jax_enable_x64", True)
     rows = []
     for case in cases():
         rows.append(compared(*case))

@@ -88,10 +88,11 @@ def table(lines: list[dict], about: dict) -> dict:
     exponents = ", ".join(f"N^{growth([x for x in lines if x['dim'] == d]):.2f} in {d}D" for d in (2, 3))
     note = (
         f"Order {ORDER}, scattered particles in random order, on {about['cores']} cores of {about['processor']} "
-        f"(`python -m benchmarks.scale`). Seconds grow as {exponents}. Memory is the peak of the process after the first "
-        "call, and after the second, while the first solution and its factors are kept."
+        f"(`python -m benchmarks.scale`). Seconds grow as {exponents}. Memory is the peak of the process after the "
+        "first call, and after the second, while the first solution and its factors are kept."
     )
-    columns = ["", "particles", "relative error", "first call (s)", "next cloud (s)", "linear solver", "peak (GB)", "peak of both (GB)"]
+    columns = ["", "particles", "relative error", "first call (s)", "next cloud (s)", "linear solver", "peak (GB)"]
+    columns += ["peak of both (GB)"]
     return {"columns": columns, "rows": rows, "note": note}
 
 

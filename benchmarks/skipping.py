@@ -10,7 +10,6 @@ import json
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -22,14 +21,11 @@ import numpy as np
 import jsmitsm as js
 from benchmarks import machine
 from benchmarks.commandline import arguments
-from jsmitsm.particle import batches
-from jsmitsm.linear import linsolve
-from jsmitsm.discretization import repeated_stencils
-from jsmitsm.discretization import rows
-from jsmitsm.discretization.rows import all_rows
-from jsmitsm.discretization.layout import discretize
+from jsmitsm.discretization import repeated_stencils, rows
 from jsmitsm.discretization.coefficients import numbers
-from jsmitsm.discretization.layout import sorted_classes
+from jsmitsm.discretization.layout import discretize, sorted_classes
+from jsmitsm.discretization.rows import all_rows
+from jsmitsm.linear import linsolve
 from jsmitsm.solution.arguments import discretized
 from jsmitsm.taylor.multi_indices import count
 
@@ -46,11 +42,13 @@ def wave(x: Any) -> Any:
 def poisson(scale: float = 1.0) -> js.Problem:
     """With a source and boundary values of this size; a fresh lambda each time."""
     exact = lambda x: scale * wave(x)
-    return js.Problem(lambda u, x: js.laplacian(u)(x) - js.laplacian(exact)(x), dict.fromkeys(SIDES, js.dirichlet(exact)))
+    pde = lambda u, x: js.laplacian(u)(x) - js.laplacian(exact)(x)
+    return js.Problem(pde, dict.fromkeys(SIDES, js.dirichlet(exact)))
 
 
 def laplace() -> js.Problem:
-    return js.Problem(lambda u, x: js.laplacian(u)(x), dict.fromkeys(SIDES, js.dirichlet(lambda x: jnp.exp(x[0]) * jnp.sin(x[1]))))
+    harmonic = js.dirichlet(lambda x: jnp.exp(x[0]) * jnp.sin(x[1]))
+    return js.Problem(lambda u, x: js.laplacian(u)(x), dict.fromkeys(SIDES, harmonic))
 
 
 def conducting() -> js.Problem:
@@ -82,7 +80,9 @@ def both(without: Callable[[int], Any], with_it: Callable[[int], Any]) -> tuple[
     return float(np.median(took[0][1:])), float(np.median(took[1][1:]))
 
 
-def local(problem: Callable[[], js.Problem], cloud: Callable[[int], js.Cloud], order: int, **options: Any) -> Callable[[int], Any]:
+def local(
+    problem: Callable[[], js.Problem], cloud: Callable[[int], js.Cloud], order: int, **options: Any
+) -> Callable[[int], Any]:
     """The local phase alone."""
     ready = {}
 
@@ -115,8 +115,9 @@ def lines() -> Iterator[tuple[str, str, float, float]]:
         _rows_of("S"), _rows_of("III"))
     yield "weights of a source that is zero", "local phase, variable coefficients", *both(
         local(conducting, scattered, order, sources=False), local(conducting, scattered, order))
+    never_repeated = mock.patch.object(repeated_stencils, "FEWEST", 10**9)
     yield "moment systems of repeated stencils", "local phase on a lattice, order 8", *both(
-        local(poisson, lattice, 8), patched(local(poisson, lattice, 8), mock.patch.object(repeated_stencils, "FEWEST", 10**9)))
+        local(poisson, lattice, 8), patched(local(poisson, lattice, 8), never_repeated))
     yield "rows of Dirichlet particles", *_held_rows()
 
     def solve(k: int) -> Any:
@@ -130,7 +131,8 @@ def lines() -> Iterator[tuple[str, str, float, float]]:
     ready = js.factorize(poisson(), scattered(0), order=order)
     yield "neighbours, rows and factors, when only data changed", "js.factorize against solve", *both(
         lambda k: ready.solve(poisson(1.0 + k)).u, lambda k: solve(k).u)
-    yield "the factorisation, when only a value on the boundary changed", "solve of the same cloud again", *_kept_factor()
+    kept = _kept_factor()
+    yield "the factorisation, when only a value on the boundary changed", "solve of the same cloud again", *kept
     yield "neighbours and the order of elimination, when only the kernel changed", "solve at a given kernel", *_kernel()
     yield "compiling for another cloud of similar size", "solve, 9,801 particles after 10,000", *_compiled_again()
 
@@ -140,7 +142,8 @@ def _for_each(order: int) -> Callable[[int], Any]:
     disc = discretized(laplace(), scattered(0), "S", order)
     nums = numbers(disc, laplace())
     nums.jac = np.broadcast_to(nums.jac, (*nums.jac.shape[:2], 1, len(nums.ids)))
-    nums.jac = np.concatenate([nums.jac, np.zeros((*nums.jac.shape[:2], count(2, disc.rec.degree) - 1, len(nums.ids)))], 2)
+    slopes = np.zeros((*nums.jac.shape[:2], count(2, disc.rec.degree) - 1, len(nums.ids)))
+    nums.jac = np.concatenate([nums.jac, slopes], 2)
     return lambda k: _weights(disc, nums)
 
 
@@ -228,8 +231,8 @@ def main() -> None:
         found.append([what, where, f"{1e3 * without:.3g}", f"{1e3 * with_it:.3g}", f"{with_it / without:.2g}"])
         print(" | ".join(found[-1]), flush=True)
     note = (
-        f"Milliseconds, medians of {REPEATS}, ten thousand particles (more in the box), on {about['cores']} cores of {about['processor']} "
-        "(`python -m benchmarks.skipping`)."
+        f"Milliseconds, medians of {REPEATS}, ten thousand particles (more in the box), on {about['cores']} cores of "
+        f"{about['processor']} (`python -m benchmarks.skipping`)."
     )
     made = {"columns": ["what is left out", "measured in", "without", "with", "ratio"], "rows": found, "note": note}
     DATA.write_text(json.dumps({"machine": about, "tables": {"skipping": made}}, indent=1) + "\n")

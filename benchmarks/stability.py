@@ -495,9 +495,9 @@ def by_subject(records, machine):
     needless = [r["error"] for r in records if r["kind"] == "flagged needlessly"]
     inexact = sum(error > 0.01 for error in needless)
     note = (
-        f"`python -m benchmarks.stability` on {machine['processor']}, JAX {machine['jax']}: every method, 1D to 3D, orders "
-        "1 to 10, float64 and float32. *Wrong* is an error above 10 %, or above 100 times that of the neighbouring "
-        "cases; *refused* cases raise an error that names the cause. Of those right, yet flagged, "
+        f"`python -m benchmarks.stability` on {machine['processor']}, JAX {machine['jax']}: every method, 1D to 3D, "
+        "orders 1 to 10, float64 and float32. *Wrong* is an error above 10 %, or above 100 times that of the "
+        "neighbouring cases; *refused* cases raise an error that names the cause. Of those right, yet flagged, "
         f"{inexact} have an error above 1 %."
     )
     columns = ["cases", "tried", "accurate", "refused", "wrong and flagged", "right, yet flagged", "silently wrong"]

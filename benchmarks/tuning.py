@@ -100,9 +100,9 @@ class Bench:
         """True error in percent and largest Lebesgue constant; NaN where the solve fails."""
         case = case or self.setup.case
         kernel = js.SuperGaussian(h * self.spacing, d)
-        near = self.stencils if h * d <= REACH else None
+        options = {"method": self.method, "order": self.order, "stencils": self.stencils if h * d <= REACH else None}
         try:
-            sol = js.solve(case.problem(), self.cloud, method=self.method, order=self.order, kernel=kernel, stencils=near)
+            sol = js.solve(case.problem(), self.cloud, kernel=kernel, **options)
         except (js.SolveError, ValueError):  # singular, or too few neighbours
             return np.nan, np.nan
         return 100 * case.error(sol), float(sol.stats["lebesgue_max"])
@@ -274,8 +274,8 @@ def record_graded(g: Graded, method: str, quick: bool) -> dict[str, Any]:
     }  # fmt: skip
 
 
-GRADED_HEAD = f"{'cloud':<15}{'method':<8}{'from':>5}{'start':>10}{'tuned':>10}{'scalar':>10}{'graded':>10}{'reference':>11}"
-GRADED_HEAD += f"{'other':>10}{'(scalar)':>10}{'solves':>8}{'(grid)':>8}  misses"
+GRADED_HEAD = f"{'cloud':<15}{'method':<8}{'from':>5}{'start':>10}{'tuned':>10}{'scalar':>10}{'graded':>10}"
+GRADED_HEAD += f"{'reference':>11}{'other':>10}{'(scalar)':>10}{'solves':>8}{'(grid)':>8}  misses"
 
 
 def graded_lines(entry: dict[str, Any]) -> list[str]:
@@ -298,14 +298,15 @@ def graded_lines(entry: dict[str, Any]) -> list[str]:
 
 # ------------------------------------------------------------------ all of it
 
-ABOUT = """Relative L2 errors in percent. start: h = 0.7 or 2 spacings, d = 4; grid: 10th percentile of a grid that knows the
-solution; paper: h = 1 spacing, d = 4; reference: what "estimate" measures from; misses: the bounds not kept,
-namely tuned at most 1.2 grid, 0.8 paper, start; less than 20 % change by 1 % of h or d; better than paper on another solution of
-the same cloud; with the jump of 4.2 at most 1.05 of paper or reference. * : no kernel of the whole grid keeps it.
+ABOUT = """Relative L2 errors in percent. start: h = 0.7 or 2 spacings, d = 4; grid: 10th percentile of a grid that
+knows the solution; paper: h = 1 spacing, d = 4; reference: what "estimate" measures from; misses: the bounds not kept,
+namely tuned at most 1.2 grid, 0.8 paper, start; less than 20 % change by 1 % of h or d; better than paper on
+another solution of the same cloud; with the jump of 4.2 at most 1.05 of paper or reference. * : no kernel of the whole
+grid keeps it.
 """
 ABOUT_GRADED = """
-One h per particle. start: 0.7 or 2 times every particle's own spacing; scalar: the best single h (and d) of a grid that knows
-the solution; graded: h = every particle's own spacing, d = 4; other: another solution of the same cloud.
+One h per particle. start: 0.7 or 2 times every particle's own spacing; scalar: the best single h (and d) of a grid
+that knows the solution; graded: h = every particle's own spacing, d = 4; other: another solution of the same cloud.
 """
 
 
@@ -326,22 +327,24 @@ def tables(results: list[dict[str, Any]]) -> dict[str, Any]:
         for start, run in e["runs"].items():
             head = [e["setup"], f"{e['method']} {e['order']}", start]
             if e["setup"] in SETUPS:
-                numbers = (run["start"], run["tuned"], e["grid_10th_percentile"], e["untuned"], e["paper"], e["reference"])
+                keys = ("grid_10th_percentile", "untuned", "paper", "reference")
+                numbers = (run["start"], run["tuned"], *(e[k] for k in keys))
                 missed = ", ".join(misses(e, run))
                 even.append([*head, *map(percent, numbers), run["solves"], e["grid_solves"], missed])
             else:
-                numbers = (run["start"], run["tuned"], e["scalar"], e["graded"], e["reference"], run["other"], e["scalar_other"])
+                best = (e[k] for k in ("scalar", "graded", "reference"))
+                numbers = (run["start"], run["tuned"], *best, run["other"], e["scalar_other"])
                 graded.append([*head, *map(percent, numbers), run["solves"], e["grid_solves"]])
     return {
         "tuning": {
-            "columns": ["problem", "method", "from h =", "start", "tuned", "grid", "h = 0.8", "paper", "reference", "solves",
-                        "(grid)", "missed"],
+            "columns": ["problem", "method", "from h =", "start", "tuned", "grid", "h = 0.8", "paper", "reference",
+                        "solves", "(grid)", "missed"],
             "rows": even,
             "note": " ".join(ABOUT.split()).replace("* :", "\\*:"),
         },
         "tuning-graded": {
-            "columns": ["cloud", "method", "from h =", "start", "tuned", "scalar", "graded", "reference", "other", "(scalar)",
-                        "solves", "(grid)"],
+            "columns": ["cloud", "method", "from h =", "start", "tuned", "scalar", "graded", "reference", "other",
+                        "(scalar)", "solves", "(grid)"],
             "rows": graded,
             "note": " ".join(ABOUT_GRADED.split()),
         },
@@ -358,7 +361,8 @@ def write(kept: dict[tuple[str, str], Any]) -> None:
 def main(wanted: list[str], quick: bool, again: bool, only_table: bool) -> None:
     jax.config.update("jax_enable_x64", True)
     names = [n for n in (*SETUPS, *GRADED) if not wanted or any(w in n for w in wanted)]
-    kept = {} if quick or not DATA.exists() else {(e["setup"], e["method"]): e for e in json.loads(DATA.read_text())["results"]}
+    before = [] if quick or not DATA.exists() else json.loads(DATA.read_text())["results"]
+    kept = {(e["setup"], e["method"]): e for e in before}
     head = None
     for name in names[:2] if quick and not wanted else names:
         new_head = ABOUT + "\n" + HEAD if name in SETUPS else ABOUT_GRADED + "\n" + GRADED_HEAD

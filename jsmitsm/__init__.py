@@ -1,15 +1,18 @@
 """Meshless solutions of boundary-value problems by local Taylor expansions, in JAX."""
 
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from jsmitsm.cloud.cloud import Cloud, box, interval, rectangle
 from jsmitsm.cloud.neighbours import Stencils, stencils
+from jsmitsm.equation.marks import meant
 from jsmitsm.equation.operators import divergence, grad, hessian, laplacian, partial
 from jsmitsm.equation.problem import Condition, Problem, condition, dirichlet, fix, free, neumann, periodic, robin
+from jsmitsm.linear.linsolve import Solver
 from jsmitsm.particle.kernels import Constant, CubicSpline, Gaussian, Kernel, SuperGaussian, Wendland
 from jsmitsm.runtime.errors import SolveError
 from jsmitsm.runtime.progress import no_progress
+from jsmitsm.solution.arguments import Formulation, Method
 from jsmitsm.solution.factorization import Factorization, factorize
 from jsmitsm.solution.solution import Solution
 from jsmitsm.solution.solve import solve
@@ -18,37 +21,48 @@ from jsmitsm.taylor.multi_indices import multi_indices
 __version__ = "0.1.0"
 
 __all__ = [
-    "Cloud", "Condition", "Constant", "CubicSpline", "Factorization", "Gaussian", "Kernel", "Problem", "Quality",
-    "Solution", "SolveError", "Stencils", "SuperGaussian", "TuneResult", "Wendland", "box", "condition", "continuation",
-    "dirichlet", "divergence", "factorize", "files", "fix", "free", "from_polygon", "from_sdf", "grad", "hessian",
-    "interval", "laplacian", "multi_indices", "neumann", "no_progress", "partial", "periodic", "plot", "quadrature",
-    "quality", "rectangle", "robin", "sdf", "show_versions", "solve", "stencils", "tune",
+    "Cloud", "Condition", "Constant", "CubicSpline", "Factorization", "Formulation", "Gaussian", "Kernel", "Method",
+    "Problem", "Quality", "Solution", "SolveError", "Solver", "Stencils", "SuperGaussian", "TuneResult", "Wendland",
+    "box", "condition", "continuation", "dirichlet", "divergence", "factorize", "files", "fix", "free", "from_polygon",
+    "from_sdf", "grad", "hessian", "interval", "laplacian", "meant", "multi_indices", "neumann", "no_progress",
+    "partial", "periodic", "plot", "quadrature", "quality", "rectangle", "robin", "sdf", "show_versions", "solve",
+    "stencils", "tune",
 ]  # fmt: skip
 
-# Imported when first used: they need more than solving does.
-_LAZY = {
-    "Quality": "cloud.quality",
-    "TuneResult": "tuning.tune",
-    "continuation": "solution.continuation",
-    "files": "show",
-    "from_polygon": "cloud.shapes",
-    "from_sdf": "cloud.shapes",
-    "plot": "show",
-    "quadrature": "cloud.quadrature",
-    "quality": "cloud.quality",
-    "sdf": "cloud",
-    "show_versions": "runtime.versions",
-    "tune": "tuning.tune",
-}
-_MODULES = ("files", "plot", "sdf")
+# Imported when first used: they need more than solving does. Where each stands is said twice, to type checkers and to
+# Python: with a module's __getattr__ in sight a checker would believe in every name.
+if TYPE_CHECKING:
+    from jsmitsm.cloud import sdf
+    from jsmitsm.cloud.quadrature import quadrature
+    from jsmitsm.cloud.quality import Quality, quality
+    from jsmitsm.cloud.shapes import from_polygon, from_sdf
+    from jsmitsm.runtime.versions import show_versions
+    from jsmitsm.show import files, plot
+    from jsmitsm.solution.continuation import continuation
+    from jsmitsm.tuning.tune import TuneResult, tune
+else:
+    _LAZY = {
+        "Quality": "cloud.quality",
+        "TuneResult": "tuning.tune",
+        "continuation": "solution.continuation",
+        "files": "show",
+        "from_polygon": "cloud.shapes",
+        "from_sdf": "cloud.shapes",
+        "plot": "show",
+        "quadrature": "cloud.quadrature",
+        "quality": "cloud.quality",
+        "sdf": "cloud",
+        "show_versions": "runtime.versions",
+        "tune": "tuning.tune",
+    }
+    _MODULES = ("files", "plot", "sdf")
 
-
-def __getattr__(name: str) -> Any:
-    if name in _MODULES:
-        return import_module(f"jsmitsm.{_LAZY[name]}.{name}")
-    if name in _LAZY:
-        return getattr(import_module(f"jsmitsm.{_LAZY[name]}"), name)
-    raise AttributeError(f"module 'jsmitsm' has no attribute {name!r}")
+    def __getattr__(name: str) -> Any:
+        if name in _MODULES:
+            return import_module(f"jsmitsm.{_LAZY[name]}.{name}")
+        if name in _LAZY:
+            return getattr(import_module(f"jsmitsm.{_LAZY[name]}"), name)
+        raise AttributeError(f"module 'jsmitsm' has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:

@@ -1,11 +1,13 @@
 """The house: packages on one way, read off the imports."""
 
 import ast
-from pathlib import Path
+import json
+import re
+from html import unescape
 
-import jsmitsm
+from benchmarks.architecture import ARROWS, MODULES, PICTURE, ROOT, house, package_imports, sentence
 
-ROOT = Path(jsmitsm.__file__).parent
+PAGE = ROOT.parent / "docs" / "architecture.md"
 # What each package may import of the others. Everything runs one way.
 MAY_IMPORT = {
     "runtime": (),
@@ -19,22 +21,6 @@ MAY_IMPORT = {
     "tuning": ("runtime", "taylor", "particle", "cloud", "equation", "linear", "discretization", "solution"),
     "show": ("runtime", "taylor", "particle", "cloud", "equation", "linear", "discretization", "solution"),
 }
-MODULES = sorted(p for p in ROOT.rglob("*.py") if p.parent != ROOT)
-NAMES = {p: ".".join(p.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__") for p in MODULES}
-
-
-def package_imports(path, tree=None):
-    """Modules of the package that ``path`` imports anywhere, as "package.module", and where: (name, node)."""
-    for node in ast.walk(tree or ast.parse(path.read_text())):
-        if isinstance(node, ast.Import):
-            for alias in node.names:
-                if alias.name.startswith("jsmitsm."):
-                    yield alias.name.removeprefix("jsmitsm."), node
-        elif isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "jsmitsm":
-            module = node.module.removeprefix("jsmitsm").lstrip(".")
-            for alias in node.names:
-                whole = f"{module}.{alias.name}".lstrip(".")
-                yield (whole if whole in NAMES.values() else module), node
 
 
 def test_every_room_stands_in_a_package_on_the_way():
@@ -45,17 +31,17 @@ def test_every_room_stands_in_a_package_on_the_way():
 def test_no_import_runs_against_the_order():
     wrong = []
     for path in MODULES:
-        own = NAMES[path].split(".")[0]
-        for name, _ in package_imports(path):
+        own = MODULES[path].split(".")[0]
+        for name in package_imports(path):
             other = name.split(".")[0]
             if other != own and other not in MAY_IMPORT[own]:
-                wrong.append(f"{NAMES[path]} imports {name or 'jsmitsm'}")
+                wrong.append(f"{MODULES[path]} imports {name or 'jsmitsm'}")
     assert not wrong, wrong
 
 
 def test_no_circle_between_modules():
     """Peel off what imports nothing that is left."""
-    left = {NAMES[p]: {name for name, _ in package_imports(p)} - {NAMES[p]} for p in MODULES}
+    left = {MODULES[p]: {name for name in package_imports(p)} - {MODULES[p]} for p in MODULES}
     while left:
         leaves = [name for name, uses in left.items() if not uses & set(left)]
         assert leaves, f"a circle of imports among {sorted(left)}"
@@ -68,12 +54,12 @@ def test_no_import_of_the_package_hides_in_a_function():
         tree = ast.parse(path.read_text())
         for function in ast.walk(tree):
             if isinstance(function, (ast.FunctionDef, ast.AsyncFunctionDef)):
-                hidden += [f"{NAMES[path]}.{function.name}: {name}" for name, _ in package_imports(path, function)]
+                hidden += [f"{MODULES[path]}.{function.name}: {name}" for name in package_imports(path, function)]
     assert not hidden, hidden
 
 
 def test_modules_fit_on_a_few_screens_and_packages_on_a_page():
-    long = {NAMES[p]: n for p in MODULES if (n := len(p.read_text().splitlines())) > 400}
+    long = {MODULES[p]: n for p in MODULES if (n := len(p.read_text().splitlines())) > 400}
     assert not long, long
     crowded = {d.name: n for d in ROOT.iterdir() if d.is_dir() and (n := len(list(d.glob("[!_]*.py")))) > 16}
     assert not crowded, crowded
@@ -81,3 +67,31 @@ def test_modules_fit_on_a_few_screens_and_packages_on_a_page():
 
 def test_every_package_and_module_says_what_it_is_for():
     assert all(ast.get_docstring(ast.parse(p.read_text())) for p in MODULES)
+
+
+# ------------------------------------------------------------------ the picture and its page
+
+
+def test_the_picture_shows_the_packages_modules_and_arrows_of_today():
+    description = re.search(r"<dc:description>(.*?)</dc:description>", PICTURE.read_text(), re.S).group(1)
+    assert json.loads(unescape(description)) == house(), "draw it again: python -m benchmarks.architecture"
+
+
+def test_every_arrow_of_the_picture_is_an_import():
+    packages = house()
+    assert all(one in packages[other]["imports"] for one, other in ARROWS)
+
+
+def test_every_package_has_a_paragraph_and_every_module_a_place_in_it():
+    paragraphs = re.split(r"^## ", PAGE.read_text(), flags=re.M)
+    for package, parts in house().items():
+        (own,) = [p for p in paragraphs if p.startswith(f"{package}\n")]
+        assert " ".join(sentence(package).split()) in " ".join(own.split()), package
+        assert not [m for m in parts["modules"] if f"`{m.split('.')[0]}`" not in own], package
+
+
+def test_the_sentence_of_a_package_says_what_it_may_import():
+    for package, allowed in MAY_IMPORT.items():
+        said = ast.get_docstring(ast.parse((ROOT / package / "__init__.py").read_text())).split("\n\n")[1]
+        named = set(re.findall(r"\w+", said)) & set(MAY_IMPORT)
+        assert named <= {*allowed, "linear"}, package

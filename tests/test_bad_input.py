@@ -238,7 +238,8 @@ ON_A_CLOUD = [
      r"bcs\['left'\]: 3 conditions", "remove some"),
     ("clamped-and-more", solve(
         pde=lambda u, x: js.laplacian(js.laplacian(u))(x),
-        bcs=dict.fromkeys(ENDS, [js.dirichlet(0.0), js.neumann(0.0), js.condition(lambda u, x, n: js.laplacian(u)(x))])),
+        bcs=dict.fromkeys(
+            ENDS, [js.dirichlet(0.0), js.neumann(0.0), js.condition(lambda u, x, n: js.laplacian(u)(x))])),
      r"bcs\['left'\]: 3 conditions", "order 4 takes 2"),
     ("too-few-for-a-beam", solve(pde=lambda u, x: js.laplacian(js.laplacian(u))(x) - 1.0), r"bcs\['left'\].*1 cond",
      "2 on every side.*neumann"),
@@ -365,7 +366,8 @@ RESIDUALS = [
     ("fields-unused", residual(lambda u, x: jnp.stack([js.laplacian(u[0])(x), u[0](x)]), fields=2), "pde.*field 1",
      "use it|lower"),
     ("too-few-equations", residual(lambda u, x: js.laplacian(u[0])(x) + u[1](x), fields=2), "pde", "2|F residuals"),
-    ("field-beyond-in-a-system", residual(lambda u, x: jnp.stack([u[0](x), u[2](x)]), fields=2), "pde.*index 2", "bounds"),
+    ("field-beyond-in-a-system", residual(lambda u, x: jnp.stack([u[0](x), u[2](x)]), fields=2), "pde.*index 2",
+     "bounds"),
     ("huge-operator", residual(lambda u, x: 1e300 * js.laplacian(u)(x) - 1.0), "pde.*1e.300", "divide the equation"),
     ("python-float", residual(lambda u, x: js.laplacian(u)(x) - float(x[0])), "pde", "float"),
     ("callback", residual(lambda u, x: js.laplacian(u)(x) - jax.pure_callback(
@@ -549,14 +551,16 @@ STACKED = {
 
 @pytest.fixture(scope="module")
 def stacked():
-    problem = js.Problem(lambda u, x, s: js.laplacian(u)(x) - s, {"left": js.dirichlet(0.0), "right": js.dirichlet(1.0)}, params=1.0)
+    bcs = {"left": js.dirichlet(0.0), "right": js.dirichlet(1.0)}
+    problem = js.Problem(lambda u, x, s: js.laplacian(u)(x) - s, bcs, params=1.0)
     alone = lambda s: js.solve(problem.replace(params=s), js.interval(0.0, 1.0, 8))
     return alone, jax.vmap(alone)(np.array([1.0, 2.0]))
 
 
 @pytest.mark.parametrize("asked", STACKED)
 def test_a_stack_of_solutions_says_what_it_is(stacked, asked):
-    with pytest.raises(ValueError, match="stack of 2 that came out of jax.vmap.*inside the mapped function, or take one"):
+    pattern = "stack of 2 that came out of jax.vmap.*inside the mapped function, or take one"
+    with pytest.raises(ValueError, match=pattern):
         STACKED[asked](stacked[1])
 
 

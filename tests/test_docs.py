@@ -5,6 +5,7 @@ import importlib
 import pkgutil
 import re
 from pathlib import Path
+from typing import Literal, get_origin
 
 import pytest
 
@@ -46,8 +47,12 @@ def public():
 def test_every_public_name_is_documented_and_in_the_reference():
     listed = set(re.findall(r"^::: ([\w.]+)$", (DOCS / "reference.md").read_text(), re.M))
     for name, thing in public().items():
-        assert thing.__doc__, f"{name} has no docstring"
-        assert listed & {thing.__module__, f"{thing.__module__}.{name}"}, f"{name} is not in docs/reference.md"
+        homes = {thing.__module__, f"{thing.__module__}.{name}"}
+        if get_origin(thing) is Literal:  # an alias, which knows neither what it means nor where it stands
+            homes = {place for place in listed if place.endswith(f".{name}")}
+        else:
+            assert thing.__doc__, f"{name} has no docstring"
+        assert listed & homes, f"{name} is not in docs/reference.md"
 
 
 def test_the_site_is_complete():

@@ -16,7 +16,8 @@ from benchmarks.problems import CASES
 
 LINEAR = [
     ("diffusion", 4), ("diffusion", 8), ("anisotropy", 4), ("rotated", 6), ("helmholtz", 6), ("heat", 4),
-    ("convection", 4), ("wave", 6), ("u_xy", 6), ("biharmonic", 4), ("transport", 4), ("third order", 6), ("dispersion", 6),
+    ("convection", 4), ("wave", 6), ("u_xy", 6), ("biharmonic", 4), ("transport", 4), ("third order", 6),
+    ("dispersion", 6),
 ]  # fmt: skip
 SHAPES = [("star", 4), ("star mixed", 4), ("star neumann", 4), ("ball", 4), ("step", 4), ("step", 8), ("cluster", 6),
           ("amoeba", 4), ("lattice step", 4)]  # fmt: skip

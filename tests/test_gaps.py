@@ -16,7 +16,11 @@ def joined(*clouds, normals=True):
     start = np.cumsum([0, *map(len, clouds)])
     groups = {"interior": np.concatenate([c.groups["interior"] + k for c, k in zip(clouds, start)])}
     groups |= {f"part{n}": c.boundary + k for n, (c, k) in enumerate(zip(clouds, start))}
-    return js.Cloud(np.concatenate([c.points for c in clouds]), groups, np.concatenate([c.normals for c in clouds]) if normals else None)
+    return js.Cloud(
+        np.concatenate([c.points for c in clouds]),
+        groups,
+        np.concatenate([c.normals for c in clouds]) if normals else None,
+    )
 
 
 @pytest.mark.parametrize("gap", [0.01, 0.125, 1.0, 100.0])
@@ -79,7 +83,9 @@ def test_spheres_that_nearly_touch():
     one = js.from_sdf(js.sdf.sphere((0, 0, 0), 1.0), ((-1,) * 3, (1,) * 3), h)
     two = js.from_sdf(js.sdf.sphere((2 + 0.3 * h, 0, 0), 1.0), ((1, -1, -1), (3.2, 1, 1)), h, seed=2)
     first, other = lambda x: x[0] ** 2 - x[1] ** 2 + x[2], lambda x: 5 * x[0] * x[1] - 7
-    sol = js.solve(js.Problem(FLAT, {"part0": js.dirichlet(first), "part1": js.dirichlet(other)}), joined(one, two), order=2)
+    sol = js.solve(
+        js.Problem(FLAT, {"part0": js.dirichlet(first), "part1": js.dirichlet(other)}), joined(one, two), order=2
+    )
     exact = np.concatenate([jax.vmap(first)(one.points), jax.vmap(other)(two.points)])
     np.testing.assert_allclose(sol.u, exact, atol=1e-11)
 
@@ -95,10 +101,14 @@ def test_inward_normals_are_refused():
 def test_stencils_of_one_piece_stay_as_they_are():
     """Holes and blunt corners hide nobody who is near, but for some seen past the very edge of a corner."""
     ell = js.from_polygon([(0, 0), (2, 0), (2, 1), (1, 1), (1, 2), (0, 2)], 0.1)
-    plate = js.from_sdf(js.sdf.difference(js.sdf.rectangle((0, 0), (2, 1)), js.sdf.circle((1, 0.5), 0.25)), ((0, 0), (2, 1)), 0.05)
+    plate = js.from_sdf(
+        js.sdf.difference(js.sdf.rectangle((0, 0), (2, 1)), js.sdf.circle((1, 0.5), 0.25)), ((0, 0), (2, 1)), 0.05
+    )
     for cloud in (ell, plate):
         held = {g: js.dirichlet(0.0) for g in cloud.groups if g != "interior"}
-        table = np.asarray(js.solve(js.Problem(LOAD, held), cloud, stencils=js.stencils(cloud, size=14))._fit.neighbours)
+        table = np.asarray(
+            js.solve(js.Problem(LOAD, held), cloud, stencils=js.stencils(cloud, size=14))._fit.neighbours
+        )
         plain = np.asarray(js.stencils(cloud, size=14).indices)
         kept = [set(a[a >= 0]) == set(b[b >= 0]) for a, b in zip(table, plain)]
         assert np.mean(kept) > 0.99

@@ -220,7 +220,8 @@ def test_values_that_a_profile_closes_over(line, names):
     """As what it is given in ``params``, whether other numbers are traced or not."""
 
     def f(t, kernel):
-        return jnp.sum(line.weights * js.solve(line.problem(line.theta), line.cloud, kernel=kernel(t), stencils=line.stencils).u ** 2)
+        sol = js.solve(line.problem(line.theta), line.cloud, kernel=kernel(t), stencils=line.stencils)
+        return jnp.sum(line.weights * sol.u**2)
 
     closed = lambda t: js.Kernel(lambda r: jnp.exp(-t["decay"] * r**2), t["h"], 3.0)
     given = lambda t: js.Kernel(lambda r, a: jnp.exp(-a * r**2), t["h"], 3.0, t["decay"])
@@ -276,8 +277,8 @@ def test_every_output_with_respect_to_everything(line, method, problem, solver):
         assert np.abs(measured).min() > 0, f"{name} moves nothing: nothing was tested"
 
 
-# What is left, compiled once each and with little effort. Differences are those of the host's path, which nothing traces.
-# The error estimate is the same code for every method, and tested above.
+# What is left, compiled once each and with little effort. Differences are those of the host's path, which nothing
+# traces. The error estimate is the same code for every method, and tested above.
 @pytest.mark.parametrize("method, form", [("I", "loo"), ("II", "loo"), ("SSPH", "loo"), ("S", "lsq")])
 def test_the_other_methods_and_forms_with_respect_to_everything(line, method, form):
     def outputs(t):
@@ -399,7 +400,9 @@ def test_gradient_through_evaluation_between_particles(line):
     assert float(jax.grad(f)(2.0)) == pytest.approx(difference(f, 2.0, 1.0), rel=BOUND)
 
 
-@pytest.mark.parametrize("at", [(0.4, 0.55), (0.5, 0.5), (0.375, 0.375)], ids=["anywhere", "a particle", "as far from four"])
+@pytest.mark.parametrize(
+    "at", [(0.4, 0.55), (0.5, 0.5), (0.375, 0.375)], ids=["anywhere", "a particle", "as far from four"]
+)
 def test_a_blended_value_has_a_slope_everywhere(at):
     """Against central differences where the weights are smooth; finite, and the same under jit, at every point."""
     lattice = js.rectangle((0, 0), (1, 1), (5, 5))

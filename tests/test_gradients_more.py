@@ -107,7 +107,8 @@ def elastic(t):
         tangent = jnp.array([-n[1], n[0]])
         return jnp.stack([u(x) @ n - 0.1, tangent @ (js.grad(u)(x) + js.grad(u)(x).T) @ n])
 
-    bcs = {"left": js.condition(slip), "right": js.condition(traction), "bottom": js.dirichlet(0.0), "top": js.dirichlet(0.2)}
+    bcs = {"left": js.condition(slip), "right": js.condition(traction)}
+    bcs |= {"bottom": js.dirichlet(0.0), "top": js.dirichlet(0.2)}
     return js.Problem(pde, bcs, fields=2, params=t["modulus"])
 
 

@@ -1,6 +1,6 @@
 """Derivatives where values are held: of nonlinear problems too they have the order of the method.
 
-A fit of order p has slopes of error O(h^p) and second derivatives of error O(h^(p-1)). Observed orders are taken between
+A fit of order p has slopes of error O(h^p), second derivatives of error O(h^(p-1)). Observed orders are taken between
 two clouds of spacing h and h / 2; they fall short of the expected ones by less than 0.6 (two coarse clouds).
 """
 
@@ -18,7 +18,9 @@ def squared(u, x):
 
 def test_the_example():
     """u'' = 6 u^2, u = 1 / (1 + x)^2: fluxes 2 and -1/4, u''(0) = 6, which the equation itself says."""
-    sol = js.solve(js.Problem(squared, {"left": js.dirichlet(1.0), "right": js.dirichlet(0.25)}), js.interval(0.0, 1.0, 21))
+    sol = js.solve(
+        js.Problem(squared, {"left": js.dirichlet(1.0), "right": js.dirichlet(0.25)}), js.interval(0.0, 1.0, 21)
+    )
     assert abs(sol.flux("left") - 2.0) < 2e-3 and abs(sol.flux("right") + 0.25) < 1e-4
     np.testing.assert_allclose(sol.derivative([[0.0]], (2,)), [6.0], rtol=1e-10)
 
@@ -40,7 +42,10 @@ def coupled(u, x):
 
 
 CASES = {
-    **{f"rod {m}": (lambda x: 1 / (1 + x[0]) ** 2, squared, 1, {"method": m, "order": 4}) for m in ("S", "I", "II", "III")},
+    **{
+        f"rod {m}": (lambda x: 1 / (1 + x[0]) ** 2, squared, 1, {"method": m, "order": 4})
+        for m in ("S", "I", "II", "III")
+    },
     "rod SSPH": (lambda x: 1 / (1 + x[0]) ** 2, squared, 1, {"method": "SSPH", "order": 4}),
     "rod lsq": (lambda x: 1 / (1 + x[0]) ** 2, squared, 1, {"formulation": "lsq", "order": 4}),
     "plate": (PLANE, CUBIC, 2, {"order": 4}),
@@ -59,9 +64,15 @@ def test_slopes_at_walls_have_the_order_of_the_method(case):
     slopes = jax.vmap(jax.jacfwd(exact))
     errors = []
     for n in {1: (17, 33), 2: (11, 21), 3: (5, 9)}[dim]:
-        cloud = [js.interval(0.0, 1.0, n), js.rectangle((0, 0), (1, 1), (n, n), jitter=0.1), js.box((0,) * 3, (1,) * 3, (n,) * 3)][dim - 1]
+        cloud = [
+            js.interval(0.0, 1.0, n),
+            js.rectangle((0, 0), (1, 1), (n, n), jitter=0.1),
+            js.box((0,) * 3, (1,) * 3, (n,) * 3),
+        ][dim - 1]
         held = {g: js.dirichlet(exact) for g in cloud.groups if g != "interior"}
-        sol = js.solve(js.Problem(source(exact, operator), held, fields=fields), cloud, u0=lambda x: 0.9 * exact(x), **options)
+        sol = js.solve(
+            js.Problem(source(exact, operator), held, fields=fields), cloud, u0=lambda x: 0.9 * exact(x), **options
+        )
         walls = cloud.points[cloud.boundary]
         errors.append(np.abs(np.asarray(sol.grad(walls)) - np.asarray(slopes(walls))).max())
     # Some come near their order on finer clouds only: SSPH 3.3, 3.6, quasilinear 3.7, 4.6 with twice the particles.

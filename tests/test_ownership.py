@@ -36,7 +36,9 @@ class Setting:
             return flux[0] if fields == 1 else jnp.stack(flux)
 
         left = js.dirichlet(self.edge) if fields == 1 else js.dirichlet(lambda x, *p: self.edge[0] * jnp.ones(fields))
-        self.problem = js.Problem(pde, {"left": left, "right": js.condition(residual)}, fields=fields, params=self.params)
+        self.problem = js.Problem(
+            pde, {"left": left, "right": js.condition(residual)}, fields=fields, params=self.params
+        )
         self.options = {"order": order}
 
     def change(self):
@@ -95,7 +97,7 @@ def test_a_solution_is_that_of_the_problem_as_it_was(case):
 
 def test_the_example_of_two_loads():
     """u'' = k, u = 0 at the ends: u(0.55) = -0.12375 k, u'(0) = -k / 2; the closure ends at k = 10."""
-    sols = [js.solve(js.Problem(lambda u, x: js.laplacian(u)(x) - k, ENDS), ROD) for k in (1.0, 10.0)]
+    sols = [js.solve(js.Problem(lambda u, x: js.laplacian(u)(x) - k, ENDS), ROD) for k in (1.0, 10.0)]  # noqa: B023
     np.testing.assert_allclose([s([[0.55]])[0] for s in sols], [-0.12375, -1.2375], rtol=1e-12)
     np.testing.assert_allclose([s.grad([[0.0]])[0, 0] for s in sols], [-0.5, -5.0], rtol=1e-12)
 
@@ -119,7 +121,9 @@ def test_factorised_continued_and_tuned_solutions():
     k = {"k": 1.0}
     ready = js.factorize(js.Problem(lambda u, x: js.laplacian(u)(x) - k["k"], ENDS), ROD)
     one = ready.solve(js.Problem(lambda u, x: js.laplacian(u)(x) - 2 * k["k"], ENDS))
-    stages = js.continuation(lambda c: js.Problem(lambda u, x: js.laplacian(u)(x) - c * k["k"] + 0 * u(x) ** 2, ENDS), ROD, [1, 2])
+    stages = js.continuation(
+        lambda c: js.Problem(lambda u, x: js.laplacian(u)(x) - c * k["k"] + 0 * u(x) ** 2, ENDS), ROD, [1, 2]
+    )
     tuned = js.tune(js.Problem(lambda u, x: js.laplacian(u)(x) - 2 * k["k"], ENDS), ROD, js.SuperGaussian(0.125, 2.5),
                     order=3, steps=1, progress=False).solution  # fmt: skip
     k["k"] = 100.0
@@ -156,7 +160,9 @@ HANDED = {
 def test_what_is_handed_out_cannot_be_changed(what, kept):
     sol = js.solve(js.Problem(lambda u, x: js.laplacian(u)(x) - 1.0, ENDS), ROD)
     sol.error_estimate()
-    sol = {"itself": lambda s: s, "pickled": lambda s: pickle.loads(pickle.dumps(s)), "copied": copy.deepcopy}[kept](sol)
+    sol = {"itself": lambda s: s, "pickled": lambda s: pickle.loads(pickle.dumps(s)), "copied": copy.deepcopy}[kept](
+        sol
+    )
     with pytest.raises(ValueError, match="read-only"):
         HANDED[what](sol)[...] = 0
 

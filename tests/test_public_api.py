@@ -2,13 +2,12 @@
 
 import ast
 import inspect
+import logging
 import os
 import pathlib
 import pickle
 import subprocess
 import sys
-
-import logging
 
 import jax
 import jax.numpy as jnp
@@ -153,8 +152,9 @@ def test_a_problem_is_a_pytree_of_its_numbers():
 @pytest.mark.parametrize("what", ["solution", "kernel", "problem", "cloud"])
 def test_checkpoint_tools_may_put_names_in_the_place_of_leaves(what, solution):
     """What orbax does: a tree of names, one per leaf, with the structure of the tree itself."""
-    thing = {"solution": solution, "kernel": js.SuperGaussian(0.1, 3.0), "problem": PROBLEM.replace(
-        bcs={"left": js.dirichlet(1.0), "right": js.robin(1.0, 2.0, lambda x: x[0])}), "cloud": CLOUD}[what]  # fmt: skip
+    problem = PROBLEM.replace(bcs={"left": js.dirichlet(1.0), "right": js.robin(1.0, 2.0, lambda x: x[0])})
+    things = {"solution": solution, "kernel": js.SuperGaussian(0.1, 3.0), "problem": problem, "cloud": CLOUD}
+    thing = things[what]
     names = jax.tree_util.tree_map_with_path(lambda path, _: jax.tree_util.keystr(path), thing)
     assert jax.tree.structure(names) == jax.tree.structure(thing)
     stored = dict(zip(jax.tree.leaves(names), map(np.asarray, jax.tree.leaves(thing))))
@@ -263,9 +263,11 @@ def total(cloud, near):
 
     def value(t):
         pde = lambda u, x, p: js.divergence(lambda y: (1.0 + p * y[0]) * js.grad(u)(y))(x) - jnp.sin(x[0])
-        problem = js.Problem(pde, {"left": js.dirichlet(t["wall"]), "right": js.robin(1.0, 1.0, t["wall"])}, params=t["k"])
+        bcs = {"left": js.dirichlet(t["wall"]), "right": js.robin(1.0, 1.0, t["wall"])}
+        problem = js.Problem(pde, bcs, params=t["k"])
         kernel = js.SuperGaussian(t["h"], t["d"])
-        sol = js.solve(problem, cloud.replace(points=t["points"]), order=3, kernel=kernel, stencils=near, solver="sparse")
+        moved = cloud.replace(points=t["points"])
+        sol = js.solve(problem, moved, order=3, kernel=kernel, stencils=near, solver="sparse")
         return jnp.sum(sol.u**2)
 
     return value

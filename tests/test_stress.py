@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import jsmitsm as js
+from benchmarks import stability as st
 from jsmitsm.linear import solver_choice
 from jsmitsm.solution import run
-from benchmarks import stability as st
 
 # What an order 4 keeps on these clouds: about ten times what was measured.
 HARD = {
@@ -69,12 +69,14 @@ def kernel(h):
 
 
 WRONG = {
-    "support": (lambda: (st.problem("poisson", 2, HOME), st.lattice(2, 0.3), {"method": "SSPH", "order": 2, **kernel(2.0)}),
+    "support": (lambda: (st.problem("poisson", 2, HOME), st.lattice(2, 0.3),
+                         {"method": "SSPH", "order": 2, **kernel(2.0)}),
                 "nearly singular"),
     "outflow layer": (lambda: (st.problem("layer", 1, {"eps": 1e-4}), st.lattice(1, 0.2), {}), "misfit"),
     "narrow source": (lambda: (st.problem("peak", 1, {"centre": np.array([0.508]), "w": 0.0075}), st.lattice(1, 0.2),
                                {"order": 2}), "source"),
-    "waves": (lambda: (st.problem("wave", 2, {"k": 2 * np.pi / (4.8 * st.spacing(2))}), st.lattice(2, 0.2), {}), "waves"),
+    "waves": (lambda: (st.problem("wave", 2, {"k": 2 * np.pi / (4.8 * st.spacing(2))}), st.lattice(2, 0.2), {}),
+              "waves"),
     "resonance": (lambda: (st.problem("resonance", 1, {**st.at_home(1), "k": float(np.pi)}), st.lattice(1, 0.2), {}),
                   "nearly singular"),
 }  # fmt: skip
@@ -111,11 +113,8 @@ def test_random_particles_on_a_line(seed):
     x = np.sort(np.random.default_rng(seed).random(38))
     points = np.concatenate([[0.0], x, [1.0]])[:, None]
     cloud = js.Cloud(points, {"left": [0], "interior": np.arange(1, 39), "right": [39]})
-    sol = js.solve(
-        js.Problem(lambda u, x: js.laplacian(u)(x) - 20 * x[0] ** 3, {"left": js.dirichlet(0), "right": js.dirichlet(1)}),
-        cloud,
-        order=5,
-    )
+    bcs = {"left": js.dirichlet(0), "right": js.dirichlet(1)}
+    sol = js.solve(js.Problem(lambda u, x: js.laplacian(u)(x) - 20 * x[0] ** 3, bcs), cloud, order=5)
     np.testing.assert_allclose(sol.u, points[:, 0] ** 5, atol=1e-11)
     assert sol.stats["lebesgue_max"] < 1.5
 
@@ -123,7 +122,9 @@ def test_random_particles_on_a_line(seed):
 # ------------------------------------------------------------------ what does not fit in memory
 
 
-@pytest.mark.parametrize("solver, memory, words", [("auto", 1e6, "rows and the matrix"), ("sparse", 4e6, "direct solver")])
+@pytest.mark.parametrize(
+    "solver, memory, words", [("auto", 1e6, "rows and the matrix"), ("sparse", 4e6, "direct solver")]
+)
 def test_a_problem_that_will_not_fit_is_refused_before_its_rows_are_made(monkeypatch, solver, memory, words):
     task, cloud = st.problem("poisson", 2, HOME), st.lattice(2, 0.2, shape=(45, 45))
     made = []

@@ -7,7 +7,19 @@ a module of this package reaches them all.
 """
 
 from benchmarks.problems.case import (
-    FACTOR, RANK, SIDES, Case, curved, laplace, on_box, robin, scattered, slope, smooth, table, zero,
+    FACTOR,
+    RANK,
+    SIDES,
+    Case,
+    curved,
+    laplace,
+    on_box,
+    robin,
+    scattered,
+    slope,
+    smooth,
+    table,
+    zero,
 )  # fmt: skip
 from benchmarks.problems.families import FAMILIES, SWEPT
 from benchmarks.problems.linear import LINEAR, layer

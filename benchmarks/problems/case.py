@@ -143,7 +143,8 @@ def robin(exact: Callable[[Any], Any]) -> Any:
 
 
 def on_box(name: str, about: str, operator: Callable, exact: Callable, lo: tuple[float, ...] = (0.0, 0.0),
-           hi: tuple[float, ...] = (1.0, 1.0), shape: Any = 21, jitter: float = 0.0, seed: int = 0, **more: Any) -> Case:  # fmt: skip
+           hi: tuple[float, ...] = (1.0, 1.0), shape: Any = 21, jitter: float = 0.0, seed: int = 0,
+           **more: Any) -> Case:  # fmt: skip
     """A case on a lattice of a box, the unit square where nothing else is said."""
     return Case(name, about, operator, exact, scenes.lattice(lo, hi, shape, jitter, seed), SIDES[: 2 * len(lo)], **more)
 

@@ -11,7 +11,19 @@ import numpy as np
 
 import jsmitsm as js
 from benchmarks import scenes
-from benchmarks.problems.case import SIDES, Case, curved, diffusion, laplace, on_box, scattered, slope, smooth, table, zero
+from benchmarks.problems.case import (
+    SIDES,
+    Case,
+    curved,
+    diffusion,
+    laplace,
+    on_box,
+    scattered,
+    slope,
+    smooth,
+    table,
+    zero,
+)
 
 # ------------------------------------------------------------------ on scattered particles of the square
 

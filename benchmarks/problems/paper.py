@@ -69,8 +69,8 @@ def _rough(name: str, about: str, source: Callable, exact: Callable, ceilings: d
 def kink_1d(at: float = 0.4472) -> Case:
     """u'' = |x - at|."""
     return _rough(
-        "kink 1D", "u'' = |x - c|, u = |x - c|^3/6", lambda x: jnp.abs(x[0] - at), lambda x: jnp.abs(x[0] - at) ** 3 / 6,
-        {4: 1e-2},
+        "kink 1D", "u'' = |x - c|, u = |x - c|^3/6",
+        lambda x: jnp.abs(x[0] - at), lambda x: jnp.abs(x[0] - at) ** 3 / 6, {4: 1e-2},
     )  # fmt: skip
 
 

@@ -97,7 +97,8 @@ SHAPES = table(
     scattered("step", "laplacian(u) = f, the density jumps 1:100", laplace, smooth, JUMPS, cloud=scenes.step),
     scattered("lattice step", "laplacian(u) = f, lattices of spacing 10:1 side by side", laplace, smooth, {4: 1e-5},
               cloud=scenes.stepped_lattice),
-    scattered("cluster", "laplacian(u) = f, a cluster 100 times as dense", laplace, smooth, JUMPS, cloud=scenes.cluster),
+    scattered("cluster", "laplacian(u) = f, a cluster 100 times as dense", laplace, smooth, JUMPS,
+              cloud=scenes.cluster),
     Case(
         "amoeba", "laplacian(u) = f on 5000 particles of an irregular domain", laplace, curved, scenes.amoeba,
         ("boundary",), ceilings={4: 1e-7}, further=PARTICLES, seconds={5000: 0.5, 100_000: 10.0}, estimates=(4,),
@@ -106,8 +107,8 @@ SHAPES = table(
         "conducting amoeba", "div((1.5 + sin(2x + y)) grad u) = f", diffusion(conducting), curved,
         scenes.amoeba, ("boundary",), ceilings={4: 1e-7},
     ),
-    Case("smooth ball", "laplacian(u) = f in 3D, u smoother than in the ball", laplace, _in_3d, scenes.ball, ("sphere",),
-         ceilings={4: 1e-6}),
+    Case("smooth ball", "laplacian(u) = f in 3D, u smoother than in the ball", laplace, _in_3d, scenes.ball,
+         ("sphere",), ceilings={4: 1e-6}),
     Case("two holes", "laplacian(u) = f on a plate with two holes", laplace, _on_plate, scenes.two_holes,
          ("outer", "hot", "cold"), ceilings={4: 1e-5}),
 )  # fmt: skip

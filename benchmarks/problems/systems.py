@@ -66,12 +66,17 @@ def _cantilever(x):
 
 
 def _displaced(x):
-    return jnp.stack([jnp.sin(1.2 * x[0]) * jnp.cosh(x[1]) + x[1] ** 2, jnp.exp(0.6 * x[0]) * jnp.cos(1.7 * x[1] + 0.2)])
+    return jnp.stack([
+        jnp.sin(1.2 * x[0]) * jnp.cosh(x[1]) + x[1] ** 2,
+        jnp.exp(0.6 * x[0]) * jnp.cos(1.7 * x[1] + 0.2),
+    ])  # fmt: skip
 
 
 def _displaced_3d(x):
     return jnp.stack([
-        jnp.sin(x[0] + 0.5 * x[1]) * jnp.cos(x[2]), jnp.exp(0.5 * x[1]) * jnp.sin(x[2] + 0.4), jnp.cos(x[0] - x[1]) * x[2]
+        jnp.sin(x[0] + 0.5 * x[1]) * jnp.cos(x[2]),
+        jnp.exp(0.5 * x[1]) * jnp.sin(x[2] + 0.4),
+        jnp.cos(x[0] - x[1]) * x[2],
     ])  # fmt: skip
 
 

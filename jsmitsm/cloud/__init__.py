@@ -1,4 +1,4 @@
-"""Particles: shapes and how they are filled, neighbours, quadrature.
+"""The particles and where they lie: shapes, filling, neighbours, integrals.
 
 Imports runtime, taylor and particle.
 """

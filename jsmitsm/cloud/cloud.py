@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from jsmitsm.runtime.arrays import Array, ArrayLike
 from jsmitsm.runtime.errors import refuse_masked, some
 from jsmitsm.runtime.tracers import frozen, owned
 
@@ -86,14 +87,14 @@ class Cloud:
 
     def __init__(
         self,
-        points: Any,
-        groups: Mapping[str, Any],
-        normals: Any = None,
-        cell_groups: Mapping[str, Any] | None = None,
+        points: ArrayLike,
+        groups: Mapping[str, ArrayLike],
+        normals: ArrayLike | None = None,
+        cell_groups: Mapping[str, ArrayLike] | None = None,
     ):
-        self.points = _checked_points(points)
+        self.points: Array = _checked_points(points)
         self.groups = _checked_groups(groups, len(self.points))
-        self.normals = _checked_normals(normals, self.points, self.groups)
+        self.normals: Array | None = _checked_normals(normals, self.points, self.groups)
         self.cell_groups = _checked_cell_groups(cell_groups, len(self.points))
         self._spacing: float | None = None
 
@@ -136,7 +137,7 @@ class Cloud:
         """Indices of all particles that are not in the interior, ascending."""
         return np.setdiff1d(np.arange(len(self)), self.groups[INTERIOR])
 
-    def replace(self, points: Any = None, normals: Any = None) -> Cloud:
+    def replace(self, points: ArrayLike | None = None, normals: ArrayLike | None = None) -> Cloud:
         """The same groups with other points or normals (traced values welcome)."""
         new = object.__new__(Cloud)
         if points is not None and np.shape(points) != self.points.shape:

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 Spacing = Callable[[np.ndarray], np.ndarray]
+SpacingLike = float | Callable[[np.ndarray], Any]
 
 # Particles per spacing^D of the densest even arrangement: hexagons in 2D; in 3D a little below the
 # 1.41 of a face-centred lattice, which relaxation from a random start does not find.

@@ -11,6 +11,7 @@ import numpy as np
 
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.particle.kernels import EDGE
+from jsmitsm.runtime.arrays import Array, ArrayLike
 from jsmitsm.runtime.interrupts import interruptible
 from jsmitsm.runtime.progress import bar
 from jsmitsm.runtime.threads import cores
@@ -41,11 +42,11 @@ class Stencils:
     Attributes
     ----------
     indices : (N, w) int32 array; the particle itself comes first, -1 fills the row.
-    radius : (N,) float array, the distance within which all particles are listed.
+    radius : (N,) float array, the distance within which all particles are listed; None where nothing needs it.
     """
 
-    indices: Any
-    radius: Any
+    indices: Array
+    radius: Array | None
 
     @property
     def width(self) -> int:
@@ -60,7 +61,7 @@ class Stencils:
 
 
 @bar("neighbours")
-def stencils(cloud: Cloud, *, size: int | None = None, radius: Any = None) -> Stencils:
+def stencils(cloud: Cloud, *, size: int | None = None, radius: ArrayLike | None = None) -> Stencils:
     """Find every particle's neighbours, once, on the host.
 
     Parameters

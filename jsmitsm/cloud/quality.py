@@ -24,7 +24,7 @@ class Quality(NamedTuple):
         return f"Quality({', '.join(f'{name}={value:.3g}' for name, value in self._asdict().items())})"
 
 
-def quality(cloud: Cloud, spacing: Any = None) -> Quality:
+def quality(cloud: Cloud, spacing: filling.SpacingLike | None = None) -> Quality:
     """How evenly the particles of a cloud lie, measured in local spacings so that graded clouds count alike.
 
     Parameters

@@ -9,7 +9,8 @@ import numpy as np
 
 from jsmitsm.cloud import contour, filling, levelset, polygons, surface
 from jsmitsm.cloud.cloud import INTERIOR, Cloud
-from jsmitsm.cloud.filling import Spacing
+from jsmitsm.cloud.filling import Spacing, SpacingLike
+from jsmitsm.runtime.arrays import ArrayLike
 from jsmitsm.runtime.progress import bar
 
 # The cosine of 5 degrees: boundary particles whose normals differ by more may stand on two sides of a corner.
@@ -21,9 +22,9 @@ Predicate = Callable[[np.ndarray], Any]
 
 @bar("cloud")
 def from_sdf(
-    sdf: Callable,
-    bounds: tuple[Any, Any],
-    spacing: Any,
+    sdf: Callable[[Any], Any],
+    bounds: tuple[ArrayLike, ArrayLike],
+    spacing: SpacingLike,
     seed: int = 0,
     groups: Mapping[str, Predicate] | None = None,
 ) -> Cloud:
@@ -78,9 +79,9 @@ def from_sdf(
 
 @bar("cloud")
 def from_polygon(
-    vertices: Any,
-    spacing: Any,
-    holes: Sequence[Any] = (),
+    vertices: ArrayLike,
+    spacing: SpacingLike,
+    holes: Sequence[ArrayLike] = (),
     seed: int = 0,
     groups: Mapping[str, Predicate] | None = None,
 ) -> Cloud:

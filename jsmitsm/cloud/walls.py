@@ -164,7 +164,7 @@ class Walls:
             if 2 * inward.sum() > len(ids):
                 raise ValueError(
                     f"normals: those of {int(inward.sum())} of {len(ids)} particles of the group {name!r} point into "
-                    f"the domain, first at particle {int(ids[inward.argmax()])}: interior particles lie in front of it; "
+                    f"the domain, first at particle {int(ids[inward.argmax()])}: interior particles lie before it; "
                     "normals are outward, turn them round (cloud.replace(normals=-cloud.normals))"
                 )
 
@@ -261,13 +261,13 @@ def nearest_seen(points: np.ndarray, size: int, which: np.ndarray | None, walls:
     """As :func:`nearest`, of the particles that each one sees."""
     found = nearest(points, size, which)
     rows = np.arange(len(points)) if which is None else which
-    hidden = None if walls is None else walls.hidden(found.indices, rows)
+    hidden = None if walls is None else walls.hidden(np.asarray(found.indices), rows)
     if hidden is None or walls is None:
         return found
     indices, radius = np.array(found.indices), np.array(found.radius)
     some = np.flatnonzero(hidden.any(axis=1))
     for factor in (4, 12):
-        pool = nearest(points, min(len(points), factor * size), rows[some]).indices
+        pool = np.asarray(nearest(points, min(len(points), factor * size), rows[some]).indices)
         unseen = walls.hidden(pool, rows[some])
         kept = _first(pool if unseen is None else np.where(unseen, -1, pool), size)
         indices = np.pad(indices, ((0, 0), (0, max(0, size - indices.shape[1]))), constant_values=-1)

@@ -1,4 +1,4 @@
-"""A problem on a cloud: supports, coefficients, rows, their health, and the two global forms.
+"""A problem on a cloud: supports, coefficients, rows of the global system, their health.
 
 Imports what stands before it but linear: runtime, taylor, particle, cloud and equation.
 """

@@ -9,6 +9,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from jsmitsm.discretization.degenerate import Degenerate, settled
 from jsmitsm.discretization.layout import Discretization, crowded
 from jsmitsm.equation.conditions import merged
 from jsmitsm.equation.problem import Problem
@@ -40,6 +41,7 @@ class Numbers:
     held: Any
     data: Any
     gamma: Any
+    degenerate: Degenerate | None = None  # what was found where the equation degenerates
 
 
 def numbers(disc: Discretization, problem: Problem, taylor: Any = None, everywhere: bool = False) -> Numbers:
@@ -55,7 +57,8 @@ def numbers(disc: Discretization, problem: Problem, taylor: Any = None, everywhe
     held = [((group.ids, k), value()) for group in disc.groups for k, value in group.held.items()]
     own_ids, own, given = _own_numbers(disc, taylor)
     data, gamma = _data_numbers(disc, taylor)
-    return Numbers(ids, jac, source, own_ids, own, given, _filled(np.zeros(disc.held.shape), held), data, gamma)
+    values = _filled(np.zeros(disc.held.shape), held)
+    return settled(disc, problem, Numbers(ids, jac, source, own_ids, own, given, values, data, gamma))
 
 
 def operator_numbers(disc: Discretization, problem: Problem, points: Any, taylor: Any) -> tuple[Any, Any]:
@@ -99,7 +102,8 @@ def _refuse_nonfinite(points: Any, *series: Any) -> None:
         bad = np.flatnonzero(~np.isfinite(np.asarray(values)).all(axis=tuple(range(np.ndim(values) - 1))))
         raise ValueError(
             f"pde: NaN or infinity at {len(bad)} particle(s), first at x = {np.asarray(points)[bad[0]]}, in the "
-            "coefficients, the source or their derivatives; they must be finite and smooth there"
+            "coefficients, the source or their derivatives; they must be finite and smooth there: where a term is "
+            "divided by a coordinate (2 / r on an axis), multiply the equation by it"
         )
 
 

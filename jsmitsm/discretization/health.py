@@ -208,7 +208,7 @@ def _wider(factor: float):
     """The nearest neighbours, ``factor`` times as many."""
 
     def attempt(points: np.ndarray, ids: np.ndarray, size: int, walls: Walls | None) -> np.ndarray:
-        return nearest_seen(points, min(len(points), round(factor * size)), ids, walls).indices
+        return np.asarray(nearest_seen(points, min(len(points), round(factor * size)), ids, walls).indices)
 
     return attempt
 

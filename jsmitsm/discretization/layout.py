@@ -14,6 +14,7 @@ from jsmitsm.cloud.neighbours import Stencils
 from jsmitsm.cloud.walls import Walls, seen
 from jsmitsm.discretization.periodic import Images, periodic_images, with_corners
 from jsmitsm.discretization.supports import check_supports, cut_off, default_kernel, find_stencils, walls_of
+from jsmitsm.equation.branches import FIELD
 from jsmitsm.equation.closing import closed, in_words
 from jsmitsm.equation.conditions import Group, group_conditions
 from jsmitsm.equation.problem import Problem
@@ -22,7 +23,7 @@ from jsmitsm.particle.elimination import Scheme
 from jsmitsm.particle.kernels import Constant, Kernel
 from jsmitsm.particle.recursion import Recursion, free_indices, recursion
 from jsmitsm.runtime.compiled import at_hand
-from jsmitsm.runtime.tracers import is_traced, owned
+from jsmitsm.runtime.tracers import concrete, is_traced, owned
 
 
 @dataclass
@@ -62,6 +63,9 @@ class Discretization:
     repeated: int = 0  # particles whose moment system was that of another
     cut_off: tuple[int, ...] = ()  # particles whose support reaches outside of the given stencil
     lengths: int = 0  # eliminations of a constant operator, where one for all is not enough
+    # Where the equation degenerates, (N,): rows of the recursion that add nothing, conditions that it implies.
+    lost: np.ndarray | None = None
+    dropped: np.ndarray | None = None
 
     @property
     def points(self) -> Any:
@@ -155,7 +159,29 @@ def discretize(
     if given_stencils and kernel is not None:
         disc.cut_off = cut_off(stencils, kernel, disc.points, disc.active)
     disc.classes = sorted_classes(disc, disc.active, stencils)
+    if traced.branches is not None and not traced.branches.depends & FIELD:
+        refuse_jumps(disc, problem)
     return disc
+
+
+def mean_spacing(disc: Discretization) -> float:
+    """The edge of the cube that each particle has for itself."""
+    points = np.asarray(concrete(disc.cloud.points))
+    return float((np.prod(np.ptp(points, axis=0)) / len(points)) ** (1.0 / disc.rec.dim))
+
+
+def refuse_jumps(disc: Discretization, problem: Problem, slots: Any = None) -> None:
+    """Refuse a problem whose operator differentiates a jump inside of the cloud.
+
+    slots (S, N): the derivatives of the field that decide where the branches depend on them.
+    """
+    near = disc.stencils.indices
+    if slots is None:  # periodic images have no values of their own
+        found = disc.traced.jumps(disc.points, near, params=problem.params)
+    else:
+        found = disc.traced.jumps(disc.cloud.points, disc.images.owners(near), params=problem.params, slots=slots)
+    if found is not None:
+        raise ValueError(f"pde: {found}")
 
 
 def _check_collocated(groups: list[Group], fields: int) -> None:
@@ -183,12 +209,23 @@ def sorted_classes(disc: Discretization, ids: np.ndarray, stencils: Stencils) ->
         used = [_width_at_hand(disc.scheme, rounded_width(width)) for width in widest]
         near = np.pad(near, ((0, 0), (0, max(0, max(used) - near.shape[1]))), constant_values=-1)
     classes = []
-    for count in np.unique(disc.n_own[ids]):
-        for k, width in enumerate(used):
-            some = ids[(disc.n_own[ids] == count) & (wide == k)]
-            if len(some):
-                classes.append(Class(some, near[some][:, :width], replace(disc.scheme, n_own=int(count)), bool(k)))
+    for k, width in enumerate(used):
+        some = ids[wide == k]
+        if len(some):
+            classes += split(disc, Class(some, near[some][:, :width], disc.scheme, bool(k)))
     return classes
+
+
+def split(disc: Discretization, cls: Class) -> list[Class]:
+    """The particles of a class sorted by the number of their own conditions and of the rows that count."""
+    own = disc.n_own[cls.ids] - (0 if disc.dropped is None else disc.dropped[cls.ids])
+    lost = np.zeros(len(cls.ids), int) if disc.lost is None else disc.lost[cls.ids]
+    parts = []
+    for count, less in sorted(set(zip(own.tolist(), lost.tolist()))):
+        at = np.flatnonzero((own == count) & (lost == less))
+        scheme = replace(cls.scheme, n_own=count, lost=less)
+        parts.append(Class(cls.ids[at], cls.neighbours[at], scheme, cls.wide))
+    return parts
 
 
 def rounded_width(width: int, step: int = 4) -> int:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from jsmitsm.discretization.coefficients import Numbers
-from jsmitsm.discretization.layout import Discretization
+from jsmitsm.discretization.layout import Discretization, mean_spacing
 from jsmitsm.particle.recursion import Recursion
 from jsmitsm.runtime.tracers import concrete, is_traced
 
@@ -43,7 +43,8 @@ def prefers_least_squares(disc: Discretization, nums: Numbers) -> bool:
     if not drift or concrete(disc.cloud.points) is None:
         return False
     speed = np.linalg.norm(jac[0, drift, 0], axis=0)
-    return bool(np.median(speed * mean_spacing(disc) / diffusion) > 2.0)
+    convective = speed * mean_spacing(disc) / np.where(diffusion > 0, diffusion, np.inf)
+    return bool(np.median(convective) > 2.0)
 
 
 def _timelike(rec: Recursion) -> bool:
@@ -64,12 +65,6 @@ def cell_peclet(disc: Discretization, nums: Numbers) -> float:
     jac = np.asarray(nums.jac)[0, :, 0]
     speed, diffusion = np.linalg.norm(jac[drift], axis=0), np.abs(jac[second]).max(axis=0)
     return float(np.median(speed * mean_spacing(disc) / np.where(diffusion > 0, diffusion, np.inf)))
-
-
-def mean_spacing(disc: Discretization) -> float:
-    """The edge of the cube that each particle has for itself."""
-    points = np.asarray(concrete(disc.cloud.points))
-    return float((np.prod(np.ptp(points, axis=0)) / len(points)) ** (1.0 / disc.rec.dim))
 
 
 def wave_number(disc: Discretization, nums: Numbers) -> float:

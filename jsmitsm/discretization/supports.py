@@ -111,7 +111,7 @@ def _found_stencils(
         found, full = nearest_seen(points, size, which, walls), min(default_size(scheme), len(points))
         if size == full:
             return found
-        wide = jumps(found.radius, images.owners(found.indices))
+        wide = jumps(np.asarray(found.radius), images.owners(found.indices))
         if cloud.dim == 3:  # there a Neumann side with small stencils has an error ten times that of the rest
             wide = np.union1d(wide, conditioned)
         return replaced(found, wide, nearest_seen(points, full, wide, walls)) if len(wide) else found

@@ -64,7 +64,8 @@ def two_stage_rows(disc: Discretization, nums: Numbers, shared: Any) -> tuple[li
 
 def _recovery_kernel(disc: Discretization) -> tuple[Kernel, Any]:
     """The kernel of stage 1 and its neighbours: wide enough to hold 1.5 times the free coefficients."""
-    points, kernel, near = disc.points, disc.kernel, disc.stencils.indices
+    points, kernel = disc.points, disc.kernel
+    near: Any = disc.stencils.indices
     assert kernel is not None  # layout gives I and II one
     count = math.ceil(1.5 * len(disc.scheme.free)) + 1
     if disc.given_stencils or is_traced(near, points, kernel):

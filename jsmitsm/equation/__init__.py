@@ -1,4 +1,4 @@
-"""What the user wrote: the problem, its operators, their record, and what depends on what.
+"""What the user wrote: the problem, its operators and conditions, traced and linearised.
 
 Imports runtime, taylor and cloud.
 """

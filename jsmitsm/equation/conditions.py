@@ -21,18 +21,6 @@ from jsmitsm.taylor.multi_indices import Slot
 
 
 @dataclass
-class Functionals:
-    """Conditions sum_s coef[i, k, s] d^b u_f = value[i, k] at n particles.
-
-    coef (n, rows, S) and value (n, rows), S running over ``slots``.
-    """
-
-    slots: tuple[Slot, ...]
-    coef: Any
-    value: Any
-
-
-@dataclass
 class Group:
     """The conditions on one group: fields whose value is held, and everything else.
 

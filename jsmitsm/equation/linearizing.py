@@ -12,6 +12,7 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
 from jsmitsm.equation.field import Field, LocalField, field_p, frozen_p
+from jsmitsm.equation.marks import DIFFERENTIATED
 from jsmitsm.runtime.jaxprs import EVERYTHING, bind, called, levels, literal
 from jsmitsm.runtime.tracers import owned
 from jsmitsm.taylor.elementwise import ELEMENTWISE
@@ -58,6 +59,11 @@ def slots_of(jaxpr: Any) -> set[Slot]:
         for inner in inner_jaxprs(eqn):
             out |= slots_of(inner)
     return out
+
+
+def is_mark(eqn: Any) -> bool:
+    """Whether an operation only names what an operator differentiates."""
+    return eqn.primitive.name == "name" and eqn.params["name"].startswith(DIFFERENTIATED)
 
 
 def check_points(jaxpr: Any, kinds: Sequence[int]) -> list[int]:
@@ -141,12 +147,12 @@ def open_fields(jaxpr: Any, consts: Sequence[Any], args: Sequence[Any], slots: d
             inner = called(eqn)
             if eqn.primitive is field_p:
                 out = [slots[eqn.params["field"], eqn.params["index"]]]
-            elif eqn.primitive is frozen_p:
+            elif eqn.primitive is frozen_p or is_mark(eqn):
                 out = vals
             elif inner is not None:
                 out = walk(inner.jaxpr, inner.consts, vals[len(vals) - len(inner.jaxpr.invars) :], share)
             elif any(slots_of(j) for j in inner_jaxprs(eqn)):
-                out = control(eqn, vals)
+                out = control(eqn, vals, lambda j, c, a: walk(j, c, a, False))
             else:
                 key = _key(eqn, vals) if share else None
                 out = done[key] if key in done else bind(eqn, *vals)
@@ -155,33 +161,37 @@ def open_fields(jaxpr: Any, consts: Sequence[Any], args: Sequence[Any], slots: d
             env.update(zip(eqn.outvars, out, strict=True))
         return [read(v) for v in jaxpr.outvars]
 
-    def control(eqn: Any, vals: list[Any]) -> list[Any]:
-        """A loop or branch whose body asks for the fields: they reach it by closure."""
-        p, name = eqn.params, eqn.primitive.name
-        if name == "custom_jvp_call":
-            return walk(p["call_jaxpr"].jaxpr, p["call_jaxpr"].consts, vals, False)
-        if name == "cond":
-            branches = [lambda operands, b=b: walk(b.jaxpr, b.consts, operands, False) for b in p["branches"]]
-            return jax.lax.switch(vals[0], branches, vals[1:])
-        if name == "scan":
-            n, m = p["num_consts"], p["num_carry"]
-            body = p["jaxpr"]
-
-            def step(carry: Any, row: Any) -> tuple[Any, Any]:
-                out = walk(body.jaxpr, body.consts, [*vals[:n], *carry, *row], False)
-                return out[:m], out[m:]
-
-            carry, ys = jax.lax.scan(step, vals[n : n + m], vals[n + m :], p["length"], p["reverse"])
-            return [*carry, *ys]
-        n, m = p["cond_nconsts"], p["body_nconsts"]
-        test, body = p["cond_jaxpr"], p["body_jaxpr"]
-        return list(jax.lax.while_loop(
-            lambda state: walk(test.jaxpr, test.consts, [*vals[:n], *state], False)[0],
-            lambda state: walk(body.jaxpr, body.consts, [*vals[n:n + m], *state], False),
-            vals[n + m:],
-        ))  # fmt: skip
-
     return walk(jaxpr, consts, args, True)
+
+
+def control(eqn: Any, vals: list[Any], walk: Callable[..., list[Any]]) -> list[Any]:
+    """A loop or branch whose body asks for the fields: they reach it by closure.
+
+    walk: performs a jaxpr, given with its constants and arguments.
+    """
+    p, name = eqn.params, eqn.primitive.name
+    if name == "custom_jvp_call":
+        return walk(p["call_jaxpr"].jaxpr, p["call_jaxpr"].consts, vals)
+    if name == "cond":
+        branches = [lambda operands, b=b: walk(b.jaxpr, b.consts, operands) for b in p["branches"]]
+        return jax.lax.switch(vals[0], branches, vals[1:])
+    if name == "scan":
+        n, m = p["num_consts"], p["num_carry"]
+        body = p["jaxpr"]
+
+        def step(carry: Any, row: Any) -> tuple[Any, Any]:
+            out = walk(body.jaxpr, body.consts, [*vals[:n], *carry, *row])
+            return out[:m], out[m:]
+
+        carry, ys = jax.lax.scan(step, vals[n : n + m], vals[n + m :], p["length"], p["reverse"])
+        return [*carry, *ys]
+    n, m = p["cond_nconsts"], p["body_nconsts"]
+    test, body = p["cond_jaxpr"], p["body_jaxpr"]
+    return list(jax.lax.while_loop(
+        lambda state: walk(test.jaxpr, test.consts, [*vals[:n], *state])[0],
+        lambda state: walk(body.jaxpr, body.consts, [*vals[n:n + m], *state]),
+        vals[n + m:],
+    ))  # fmt: skip
 
 
 def _key(eqn: Any, vals: list[Any]) -> Any:
@@ -305,6 +315,7 @@ class Record(NamedTuple):
     slots: tuple[Slot, ...]
     outputs: tuple[int | None, ...]
     n_equations: int
+    written: Any  # the residual as it was written, with its fields and calls: inputs but for the slots
 
 
 def record(
@@ -347,15 +358,13 @@ def record(
 
     third = jax.make_jaxpr(derivatives)(*map(_shaped, second.jaxpr.invars))
     # The constants of the first trace are the last inputs of the third; make them constants again.
-    n = len(flat.constvars)
-    jaxpr: Any = third.jaxpr
+    n, jaxpr = len(flat.constvars), third.jaxpr
     jaxpr = jaxpr.replace(
         constvars=[*jaxpr.constvars, *jaxpr.invars[len(jaxpr.invars) - n :]],
         invars=jaxpr.invars[: len(jaxpr.invars) - n],
     )
-    # What the residual closes over may be changed in place later: a record holds copies.
-    kept = tuple(map(owned, (*third.consts, *first.consts)))
-    return Record(jaxpr, kept, ordered, tuple(outputs), flat.outvars[0].aval.shape[0])
+    kept = tuple(map(owned, (*third.consts, *first.consts)))  # the user may change the arrays in place
+    return Record(jaxpr, kept, ordered, tuple(outputs), flat.outvars[0].aval.shape[0], flat)
 
 
 def _shaped(v: Any) -> jax.ShapeDtypeStruct:

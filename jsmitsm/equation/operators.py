@@ -4,16 +4,25 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeAlias, TypeVar, overload
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.ad_checkpoint import checkpoint_name
 
 from jsmitsm.equation.field import Field, LocalField, total, unit
+from jsmitsm.equation.marks import ALONG, DIFFERENTIATED
 from jsmitsm.taylor.multi_indices import MultiIndex
 
+Function: TypeAlias = Callable[[Any], jax.Array]
+Same = TypeVar("Same", Field, LocalField)
 
+
+@overload
+def partial(u: Same, multi_index: MultiIndex | int) -> Same: ...
+@overload
+def partial(u: Function, multi_index: MultiIndex | int) -> Function: ...
 def partial(u: Any, multi_index: MultiIndex | int) -> Any:
     """The derivative d^a u, a function of the point.
 
@@ -44,6 +53,10 @@ def partial(u: Any, multi_index: MultiIndex | int) -> Any:
     return derivative
 
 
+@overload
+def grad(u: Field | LocalField) -> LocalField: ...
+@overload
+def grad(u: Function) -> Function: ...
 def grad(u: Any) -> Any:
     """The gradient of ``u``, a function of the point; derivatives on the last axis.
 
@@ -62,6 +75,10 @@ def grad(u: Any) -> Any:
     return lambda x: jnp.stack([_along(function, i)(_point(x)) for i in range(len(_point(x)))], -1)
 
 
+@overload
+def hessian(u: Field | LocalField) -> LocalField: ...
+@overload
+def hessian(u: Function) -> Function: ...
 def hessian(u: Any) -> Any:
     """The second derivatives of ``u``, a function of the point: (D, D), or (F, D, D).
 
@@ -87,6 +104,10 @@ def hessian(u: Any) -> Any:
     return matrix
 
 
+@overload
+def laplacian(u: Same) -> Same: ...
+@overload
+def laplacian(u: Function) -> Function: ...
 def laplacian(u: Any) -> Any:
     """The sum of the second derivatives of ``u``, a function of the point: a scalar, or (F,).
 
@@ -104,6 +125,10 @@ def laplacian(u: Any) -> Any:
     return lambda x: total(_along(_along(function, i), i)(_point(x)) for i in range(len(_point(x))))
 
 
+@overload
+def divergence(v: LocalField) -> Field | LocalField: ...
+@overload
+def divergence(v: Function) -> Function: ...
 def divergence(v: Any) -> Any:
     """The divergence of ``v``, a function of the point, summed over the last axis.
 
@@ -172,9 +197,13 @@ def _array_valued(function: Any) -> Callable[[Any], Any]:
 def _along(function: Callable[[Any], Any], axis: int) -> Callable[[Any], Any]:
     """The derivative of a function of the point along one axis, by forward mode."""
 
+    def named(y: Any) -> Any:
+        return checkpoint_name(function(y), f"{DIFFERENTIATED}{axis}")
+
     def slope(y: Any) -> Any:
         direction = np.zeros(len(y), y.dtype)
         direction[axis] = 1
-        return jax.jvp(function, (y,), (direction,))[1]
+        with jax.named_scope(ALONG):
+            return jax.jvp(named, (y,), (direction,))[1]
 
     return slope

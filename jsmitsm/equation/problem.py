@@ -9,6 +9,7 @@ import jax
 import numpy as np
 
 from jsmitsm.equation.tracing import Traced
+from jsmitsm.runtime.arrays import ArrayLike, ValueOrFunction
 from jsmitsm.runtime.errors import refuse_masked
 
 
@@ -55,7 +56,7 @@ class Condition:
         return f"{self.kind}({', '.join(shown + ([f'field={self.field}'] if self.field is not None else []))})"
 
 
-def dirichlet(value: Any, field: int | None = None) -> Condition:
+def dirichlet(value: ValueOrFunction, field: int | None = None) -> Condition:
     """u = value on a group.
 
     value : a scalar, an array over the group (n,), or a function of x (and of params, where the
@@ -72,7 +73,7 @@ def dirichlet(value: Any, field: int | None = None) -> Condition:
     return Condition("dirichlet", _field(field), value=_value(value, "value"))
 
 
-def neumann(value: Any, field: int | None = None) -> Condition:
+def neumann(value: ValueOrFunction, field: int | None = None) -> Condition:
     """n . grad u = value on a group; ``value`` and ``field`` as in :func:`dirichlet`.
 
     >>> import jsmitsm as js
@@ -82,7 +83,9 @@ def neumann(value: Any, field: int | None = None) -> Condition:
     return Condition("neumann", _field(field), value=_value(value, "value"))
 
 
-def robin(a: Any, b: Any, value: Any, field: int | None = None) -> Condition:
+def robin(
+    a: ValueOrFunction, b: ValueOrFunction, value: ValueOrFunction, field: int | None = None
+) -> Condition:
     """a u + b n . grad u = value on a group; each of the three, and ``field``, as in :func:`dirichlet`.
 
     Raises ValueError where ``a`` and ``b`` are both zero.
@@ -128,7 +131,7 @@ def periodic(first: str, second: str) -> Condition:
     return Condition("periodic", groups=(first, second))
 
 
-def fix(indices: Any, value: Any, field: int | None = None) -> Condition:
+def fix(indices: ArrayLike, value: ValueOrFunction, field: int | None = None) -> Condition:
     """Hold the particles ``indices`` (interior ones too) at ``value``; give it under any free key.
 
     ``value`` and ``field`` as in :func:`dirichlet`. Raises ValueError for numbers that are none, or given twice.

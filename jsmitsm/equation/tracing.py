@@ -14,14 +14,16 @@ import numpy as np
 from jax.extend.core import Literal
 
 from jsmitsm.equation import dependence
+from jsmitsm.equation.branches import Branches, branches
 from jsmitsm.equation.dependence import EXTRAS, FIELD, JUMPS, POINT, Facts
 from jsmitsm.equation.field import local_field
+from jsmitsm.equation.jumps import jumps
 from jsmitsm.equation.linearizing import Record, record
 from jsmitsm.equation.record_form import Form, is_fixed
 from jsmitsm.equation.recording import recalled
 from jsmitsm.runtime.compiled import fingerprint, kept
 from jsmitsm.runtime.jaxprs import EVERYTHING, NOTHING, levels
-from jsmitsm.runtime.tracers import is_traced
+from jsmitsm.runtime.tracers import any_number, is_traced
 from jsmitsm.runtime.whole_program import in_one_program
 from jsmitsm.taylor.jets import evaluate, plain
 from jsmitsm.taylor.multi_indices import Slot, count
@@ -38,15 +40,14 @@ COMPILATIONS = 0
 class Traced:
     """The record of a residual r(x, d^b u, extras, params) of E equations in S slots.
 
-    It is closed: the residual's function is not called again, and the arrays it closed over are copies. A pytree,
-    whose leaves are those of floats.
+    It is closed: no function is called again, arrays are copies. A pytree, whose leaves are the arrays of floats.
 
     ``slots``: the (field, multi-index) pairs whose coefficient is not identically zero, graded.
     ``pattern`` (E, S) bool: which equation holds which slot.  ``order``: per equation the highest
     derivative, -1 if none.  ``linear``: no coefficient depends on the field.  ``constant``: linear,
     and no coefficient depends on x or the extras (on parameters it may).  ``source``: what a
     residual leaves at u = 0: "zero", "constant" or "variable" (in x or the extras).
-    ``uses_extras``: whether an extra reaches the residual.
+    ``uses_extras``: whether an extra reaches the residual.  ``branches``: those that it differentiates, if any.
     """
 
     dim: int
@@ -59,6 +60,7 @@ class Traced:
     constant: bool
     source: str
     uses_extras: bool
+    branches: Branches | None = field(repr=False)
     _record: Record = field(repr=False)
     _n_extras: int = field(repr=False)
     _params_tree: Any = field(repr=False)
@@ -106,6 +108,17 @@ class Traced:
         if self.source == "zero" and slots is None:
             return jac, None
         return jac, self._compute(inputs, degree, False, True)[1]
+
+    def with_any_numbers(self) -> Traced:
+        """The same with some numbers for the constants that are only traced."""
+        return replace(self, _record=self._record._replace(consts=tuple(map(any_number, self._record.consts))))
+
+    def jumps(self, points: Any, near: Any, *, params: Any = None, slots: Any = None) -> str | None:
+        """What jumps under a derivative, in words, see :mod:`jsmitsm.jumps`; None: nothing does."""
+        if self.branches is None:
+            return None
+        consts = self._record.consts[len(self._record.consts) - len(self._record.written.constvars) :]
+        return jumps(self.branches, points, near, params, consts, slots)
 
     def _inputs(self, points: Any, degree: int, extras: Sequence[Any], params: Any, slots: Any) -> _Inputs:
         """Check and bring in the order of the jaxpr."""
@@ -362,6 +375,7 @@ def _classified(r: Record, dim: int, fields: int, n_extras: int, params_tree: An
         constant=linear and not every & (POINT | EXTRAS),
         source=source,
         uses_extras=bool((every | _bits(facts[0])) & EXTRAS),
+        branches=branches(r.written, r.consts[len(r.consts) - len(r.written.constvars) :], n_extras),
         _record=r,
         _n_extras=n_extras,
         _params_tree=params_tree,

@@ -1,4 +1,4 @@
-"""The global linear solve: its derivative rule, backends, kept factors, condition numbers.
+"""The global system solved: backends, kept factors, and the derivative of a linear solve.
 
 Imports runtime.
 """

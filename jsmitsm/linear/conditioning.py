@@ -42,10 +42,10 @@ def inverse_norm(apply: Callable[..., Any], n: int) -> float:
     return max(best, 2.0 * float(abs(apply(alternating, False)).sum()) / (3.0 * n))
 
 
-def near_null_vector(apply: Callable[..., Any], n: int, steps: int = 3) -> np.ndarray:
-    """Unit vector (n,) that A maps nearest to zero: a few powers of (A^T A)^-1."""
+def near_null_vector(apply: Callable[..., Any], n: int) -> np.ndarray:
+    """Unit vector (n,) that A maps nearest to zero: three powers of (A^T A)^-1."""
     v = np.random.default_rng(1).standard_normal((n, 1))
-    for _ in range(steps):
+    for _ in range(3):
         w = apply(v / np.linalg.norm(v), True)
         v = apply(w / np.linalg.norm(w), False)
     return v[:, 0] / np.linalg.norm(v)

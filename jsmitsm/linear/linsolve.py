@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from copy import deepcopy
 from functools import partial
-from typing import Any
+from typing import Any, Literal, TypeAlias, get_args
 
 import jax
 import jax.numpy as jnp
@@ -38,7 +38,9 @@ __all__ = [
     "solve",
 ]
 
-SOLVERS = ("auto", "dense", "sparse", "mixed", "iterative")
+Solver: TypeAlias = Literal["auto", "dense", "sparse", "mixed", "iterative"]
+"""What ``solver`` may be, a type for annotations."""
+SOLVERS = get_args(Solver)
 
 
 def solve(

@@ -13,7 +13,7 @@ import numpy as np
 LEAF = 30  # unknowns of a region that is not cut further; 15 to 60 give the same fill-in
 
 
-def nested_dissection(rows: np.ndarray, cols: np.ndarray, points: np.ndarray, leaf: int = LEAF) -> np.ndarray:
+def nested_dissection(rows: np.ndarray, cols: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Nested-dissection order of the unknowns of a sparse matrix.
 
     Args:
@@ -21,7 +21,6 @@ def nested_dissection(rows: np.ndarray, cols: np.ndarray, points: np.ndarray, le
         taken without directions, and entries on the diagonal or named twice do no harm.
       points: (n, D) float array, a coordinate for every unknown, in any unit of length. Unknowns
         without one (a row with NaN: a Lagrange multiplier) are ordered last.
-      leaf: regions of at most this many unknowns are not cut further.
 
     Returns:
       (n,) integer array `order`: unknown `order[k]` is eliminated in step `k`.
@@ -44,11 +43,11 @@ def nested_dissection(rows: np.ndarray, cols: np.ndarray, points: np.ndarray, le
         number[inner] = np.arange(len(inner))
         r, c = number[rows], number[cols]
         kept = (r >= 0) & (c >= 0)
-        order = nested_dissection(r[kept], c[kept], points[inner], leaf)
+        order = nested_dissection(r[kept], c[kept], points[inner])
         return np.concatenate([inner[order], np.flatnonzero(~placed)])
-    if points.shape[1] == 1 or n <= leaf:  # a chain fills in least from end to end
+    if points.shape[1] == 1 or n <= LEAF:  # a chain fills in least from end to end
         return np.argsort(points[:, 0], kind="stable")
-    code, depth, along = _halve(points, leaf)
+    code, depth, along = _halve(points)
     level = _separator_levels(rows, cols, code, depth)
     # Every region ends with its separator, after the two halves: sort by the end of the region,
     # smaller regions first where several end at the same place.
@@ -58,10 +57,10 @@ def nested_dissection(rows: np.ndarray, cols: np.ndarray, points: np.ndarray, le
     return along[np.argsort(key[along], kind="stable")]
 
 
-def spatial_order(points: np.ndarray, leaf: int = LEAF) -> np.ndarray:
+def spatial_order(points: np.ndarray) -> np.ndarray:
     """The unknowns region by region, neighbours near one another: for what sweeps over a matrix and eliminates nothing.
 
-    ``points``, ``leaf`` and what comes back as for :func:`nested_dissection`, which takes eight times as long.
+    ``points`` and what comes back as for :func:`nested_dissection`, which takes eight times as long.
 
     Example:
       >>> spatial_order(np.array([[2.0], [0.0], [1.0]]))
@@ -71,15 +70,15 @@ def spatial_order(points: np.ndarray, leaf: int = LEAF) -> np.ndarray:
     placed = np.isfinite(points).all(axis=1)
     inner = np.flatnonzero(placed)
     here = points[inner]
-    flat = points.shape[1] == 1 or len(inner) <= leaf
-    order = np.argsort(here[:, 0], kind="stable") if flat else _halve(here, leaf)[2]
+    flat = points.shape[1] == 1 or len(inner) <= LEAF
+    order = np.argsort(here[:, 0], kind="stable") if flat else _halve(here)[2]
     return np.concatenate([inner[order], np.flatnonzero(~placed)])
 
 
-def _halve(points: np.ndarray, leaf: int) -> tuple[np.ndarray, int, np.ndarray]:
+def _halve(points: np.ndarray) -> tuple[np.ndarray, int, np.ndarray]:
     """Binary code of every point's region, digits of the code, and the points in spatial order."""
     n, dim = points.shape
-    depth = int(np.ceil(np.log2(n / leaf)))
+    depth = int(np.ceil(np.log2(n / LEAF)))
     code = np.zeros(n, np.int64)
     # One order per axis, kept sorted inside every region, so that no level has to sort again.
     orders = [np.argsort(points[:, d], kind="stable") for d in range(dim)]

@@ -1,4 +1,4 @@
-"""One particle, written once: kernels, the recursion, moment systems, and the vmap over them.
+"""One particle: its kernel, the recursion that its equation gives, its moment system.
 
 Imports runtime and taylor.
 """

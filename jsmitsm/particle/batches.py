@@ -1,7 +1,6 @@
-"""The rows of all particles, and the global system they make.
+"""What is written for one particle, mapped over many: their rows and their Taylor coefficients.
 
-The per-particle moment systems are vmapped in blocks that stay in cache; the sparsity pattern
-is fixed by the stencils and known before.
+The moment systems are vmapped in blocks that stay in cache.
 """
 
 from __future__ import annotations

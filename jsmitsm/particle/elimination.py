@@ -10,9 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm.particle.polynomials import whitening
-from jsmitsm.particle.recursion import Recursion, constraints, substitution
-from jsmitsm.particle.small_systems import null_space
+from jsmitsm.particle.recursion import Recursion, constraints, row_lifts, substitution
+from jsmitsm.particle.small_systems import independent, null_space
 from jsmitsm.taylor.multi_indices import Slot
+
+# A row of the recursion below this part of its equation's largest holds nothing but rounding.
+SMALL = 1e-12
 
 
 @dataclass(frozen=True)
@@ -25,6 +28,7 @@ class Scheme:
     own : slots of the particle's own boundary conditions, and their number.
     data : slots of the conditions that neighbours contribute as data, and their number.
     sourced : whether the source's weights are wanted.
+    lost : rows of the recursion that add nothing to the others, where the equation degenerates.
     """
 
     method: str
@@ -36,6 +40,7 @@ class Scheme:
     data: tuple[Slot, ...] = ()
     n_data: int = 0
     sourced: bool = True
+    lost: int = 0
 
 
 class Elimination(NamedTuple):
@@ -65,11 +70,28 @@ def eliminate(scheme: Scheme, jac: Any, length: Any) -> Elimination:
         return Elimination(white, jnp.zeros((white.shape[0], matrix.shape[0])), lift, rows)
     if scheme.method == "S":
         white = _blocks(jnp.asarray(whitening(rec.dim, rec.order)), rec.fields)
+        if scheme.lost:
+            return _of_lower_rank(scheme, matrix, lift, length, white, rows)
         z, q = null_space(matrix @ white)
         return Elimination(white @ z, white @ q, lift, rows)
     order = np.concatenate([scheme.free, np.setdiff1d(_all_free(scheme), scheme.free)]).astype(int)
     z, q = substitution(matrix, order, np.array(scheme.dependent))
     return Elimination(z[:, : len(scheme.free)], q, lift, rows)
+
+
+def _of_lower_rank(scheme: Scheme, matrix: Any, lift: Any, length: Any, white: Any, rows: Any) -> Elimination:
+    """The elimination where some rows add nothing: by those that do, the largest first."""
+    # Rows of unit length hide that rounding is all there is of one.
+    rec = scheme.rec
+    size = row_lifts(rec, length) / lift
+    equation = np.array([e for e, _ in rec.row_index])
+    largest = jnp.stack([jnp.max(jnp.where(equation == e, size, 0.0)) for e in range(len(rec.levels))])[equation]
+    small = size < SMALL * largest
+    damped = jnp.where(small, size / jnp.where(largest > 0, largest, 1.0), 1.0)
+    wide = (damped[:, None] * matrix) @ white
+    chosen = independent(wide, len(matrix) - scheme.lost)
+    z, q = null_space(chosen @ wide)
+    return Elimination(white @ z, white @ (q @ chosen), damped * lift, rows)
 
 
 def eliminate_on_host(scheme: Scheme, jac: np.ndarray, length: float = 1.0) -> Elimination:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jsmitsm.runtime.arrays import Array, ArrayLike
 from jsmitsm.runtime.tracers import is_traced
 
 # A particle that sits on the edge of a support belongs to it; rounding must not decide that.
@@ -44,7 +45,7 @@ class Kernel:
     Kernel(h=0.2, d=2)
     """
 
-    def __init__(self, profile: Callable[..., Any], h: Any, d: Any, params: Any = None):
+    def __init__(self, profile: Callable[..., Any], h: ArrayLike, d: ArrayLike, params: Any = None):
         if not callable(profile):
             raise ValueError(
                 f"profile: expected a function of the scaled distance r, got {type(profile).__name__}; "
@@ -55,26 +56,27 @@ class Kernel:
         self._set(h, d)
         _check_profile(self)
 
-    def _set(self, h: Any, d: Any) -> None:
-        self.h, self.d = _checked(h, "h", (0, 1)), _checked(d, "d", (0,))
+    def _set(self, h: ArrayLike, d: ArrayLike) -> None:
+        self.h: float | Array = _checked(h, "h", (0, 1))
+        self.d: float | jax.Array = _checked(d, "d", (0,))
 
-    def profile(self, r: Any) -> Any:
+    def profile(self, r: Any) -> jax.Array:
         """The weight at the scaled distance ``r``, before the support cuts it off."""
         return self._profile(r) if self.params is None else self._profile(r, self.params)
 
-    def weight(self, r: Any) -> Any:
+    def weight(self, r: Any) -> jax.Array:
         """The weight at the scaled distance ``r`` (any shape), zero outside the support."""
         return jnp.where(r <= self.d * EDGE, self.profile(r), 0.0)
 
     @property
-    def length(self) -> Any:
+    def length(self) -> float | Array:
         """The length by which offsets are divided, of the size of the support: a scalar or (N,), like ``h``."""
         xp = jnp if is_traced(self.h, self.d) else np
         return self.h * xp.minimum(self.d, 2.0)
 
     def at(self, i: Any) -> Kernel:
         """The kernel of particle ``i``: its own smoothing length where there is one per particle."""
-        return self.replace(h=self.h[i]) if jnp.ndim(self.h) else self
+        return self.replace(h=cast(Array, self.h)[i]) if jnp.ndim(self.h) else self
 
     def replace(self, **changes: Any) -> Kernel:
         """The same kernel with other ``changes``: ``h``, ``d`` or ``params``; ValueError for other names."""
@@ -105,7 +107,7 @@ class Kernel:
 class _Named(Kernel):
     """A kernel with a profile of its own: needs only h and d."""
 
-    def __init__(self, h: Any, d: Any):
+    def __init__(self, h: ArrayLike, d: ArrayLike):
         self._profile = None  # type: ignore[assignment]  # the class has its own
         self.params = None
         self._set(h, d)
@@ -123,10 +125,10 @@ class SuperGaussian(_Named):
     4.0
     """
 
-    def profile(self, r: Any) -> Any:
+    def profile(self, r: Any) -> jax.Array:
         return (self.d**2 - r**2) * jnp.exp(-(r**2))
 
-    def normalization(self, dim: int) -> Any:
+    def normalization(self, dim: int) -> float | Array:
         """The constant G / (h sqrt(pi))^D of eq. (30), ``dim`` = D; ValueError unless that is 1, 2 or 3."""
         if dim not in (1, 2, 3):
             raise ValueError(f"dim: expected 1, 2 or 3 dimensions, got {dim!r}")
@@ -142,7 +144,7 @@ class Gaussian(_Named):
     1.0
     """
 
-    def profile(self, r: Any) -> Any:
+    def profile(self, r: Any) -> jax.Array:
         return jnp.exp(-(r**2))
 
 
@@ -162,7 +164,7 @@ class Wendland(_Named):
     0.0
     """
 
-    def profile(self, r: Any) -> Any:
+    def profile(self, r: Any) -> jax.Array:
         q = r / self.d
         return (1 - q) ** 6 * (35 * q**2 + 18 * q + 3) / 3
 
@@ -179,7 +181,7 @@ class CubicSpline(_Named):
     0.25
     """
 
-    def profile(self, r: Any) -> Any:
+    def profile(self, r: Any) -> jax.Array:
         q = r / self.d
         return jnp.where(q <= 0.5, 1 - 6 * q**2 + 6 * q**3, 2 * (1 - q) ** 3)
 
@@ -193,7 +195,7 @@ class Constant(_Named):
     1.0
     """
 
-    def profile(self, r: Any) -> Any:
+    def profile(self, r: Any) -> jax.Array:
         return jnp.ones_like(r)
 
 
@@ -212,7 +214,9 @@ def _checked(value: Any, name: str, dims: tuple[int, ...]) -> Any:
         raise ValueError(f"{name}: expected {kinds}, got an array of shape {array.shape}")
     if not (np.isfinite(array) & (array > 0)).all():
         raise ValueError(f"{name}: expected positive finite values, got {_short(array)}; {name} scales the support")
-    return float(array) if array.ndim == 0 and not isinstance(value, jax.Array) else value
+    if isinstance(value, jax.Array):
+        return value
+    return float(array) if array.ndim == 0 else array
 
 
 def _check_profile(kernel: Kernel) -> None:

@@ -160,8 +160,8 @@ def constraints(rec: Recursion, jac: Any, length: Any, xp: Any = jnp) -> tuple[A
         np.add.at(matrix, (row, col), values)
     else:
         matrix = jnp.zeros(shape, values.dtype).at[row, col].add(values)
-    norm = xp.sqrt(xp.sum(matrix**2, axis=1))
-    norm = xp.where(norm > 0, norm, 1.0)
+    square = xp.sum(matrix**2, axis=1)
+    norm = xp.sqrt(xp.where(square > 0, square, 1.0))  # an empty row has a derivative too
     return matrix / norm[:, None], row_lifts(rec, length, xp) / norm
 
 

@@ -24,7 +24,7 @@ def safe_root(x: Any) -> Any:
 
 @jax.custom_jvp
 def null_space(matrix: Any) -> tuple[Any, Any]:
-    """Orthonormal basis Z of the null space of C (r, k), and the pseudo-inverse Q of C (full rank).
+    """Orthonormal basis Z of the null space of C (r, k), and the pseudo-inverse Q of C (full rank, else NaN).
 
     Householder reflections in plain jnp, so that it batches without LAPACK.
     """
@@ -42,7 +42,9 @@ def null_space(matrix: Any) -> tuple[Any, Any]:
         return x - jnp.outer(v, v @ x), q - jnp.outer(q @ v, v)
 
     x, q = jax.lax.fori_loop(0, r, reflect, (matrix.T, jnp.eye(k, dtype=matrix.dtype)))
-    return q[:, r:], q[:, :r] @ _inverse_lower(x[:r].T)
+    # Of a row that repeats others rounding is left: what it would say of the solution is not to be used.
+    sound = jnp.all(jnp.abs(jnp.diagonal(x)) > 1e-13)
+    return jnp.where(sound, q[:, r:], jnp.nan), q[:, :r] @ _inverse_lower(x[:r].T)
 
 
 @null_space.defjvp
@@ -53,6 +55,19 @@ def _null_space_jvp(primals, tangents):
     dz = -q @ (change @ z)
     dq = z @ ((change @ z).T @ (q.T @ q)) - q @ (change @ q)
     return (z, q), (dz, dq)
+
+
+def independent(matrix: Any, rank: int) -> Any:
+    """Which ``rank`` rows of a matrix (r, k) span it, the largest first, as rows of the unit matrix (rank, r)."""
+    rest = jax.lax.stop_gradient(matrix)
+    chosen = []
+    for _ in range(rank):
+        k = jnp.argmax(jnp.sum(rest**2, axis=1))
+        v = rest[k] / jnp.sqrt(jnp.maximum(jnp.sum(rest[k] ** 2), jnp.finfo(rest.dtype).tiny))
+        rest = rest - jnp.outer(rest @ v, v)
+        rest = jnp.where((jnp.arange(len(rest)) == k)[:, None], 0.0, rest)
+        chosen.append(jnp.arange(len(rest)) == k)
+    return jnp.stack(chosen).astype(matrix.dtype) if rank else jnp.zeros((0, len(matrix)), matrix.dtype)
 
 
 def _inverse_lower(lower: Any) -> Any:

@@ -1,4 +1,4 @@
-"""What JAX and the machine need: programs kept whole, threads, progress, errors.
+"""What JAX and the machine need: whole programs compiled once, threads, progress, errors.
 
 Imports nothing of the package.
 """

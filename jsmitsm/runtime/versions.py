@@ -6,13 +6,13 @@ import os
 import platform
 import sys
 from importlib.metadata import PackageNotFoundError, version
-from typing import Any
+from typing import TextIO
 
 _NEEDED = ("jax", "jaxlib", "numpy", "scipy", "optax")
 _EXTRAS = ("matplotlib", "meshio", "shapely", "pandas", "xarray", "pyamg", "pypardiso", "tqdm")
 
 
-def show_versions(file: Any = None) -> None:
+def show_versions(file: TextIO | None = None) -> None:
     """Print the versions of jsmitsm, Python and the libraries, the devices and the precision.
 
     Paste it into a report of a fault. ``file``: where to print, standard output if not given.

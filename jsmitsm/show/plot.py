@@ -16,6 +16,7 @@ import numpy as np
 from jsmitsm.cloud.cloud import INTERIOR, Cloud
 from jsmitsm.cloud.neighbours import Stencils
 from jsmitsm.cloud.triangulation import simplices
+from jsmitsm.particle.kernels import Kernel
 from jsmitsm.show import drawing
 from jsmitsm.show.drawing import COLOURS, GREY, MARKERS
 from jsmitsm.solution.solution import Solution
@@ -23,8 +24,8 @@ from jsmitsm.solution.solution import Solution
 __all__ = ["cloud", "convergence", "error", "estimate", "solution", "sparsity", "tuning", "values"]
 
 
-def cloud(what: Any, *, normals: bool = False, support: int | None = None, kernel: Any = None, stencils: Any = None,
-          legend: bool = True, ax: Any = None) -> Any:  # fmt: skip
+def cloud(what: Cloud | Solution, *, normals: bool = False, support: int | None = None, kernel: Kernel | None = None,
+          stencils: Stencils | None = None, legend: bool = True, ax: Any = None) -> Any:  # fmt: skip
     """The particles of a cloud, coloured by group; 1D, 2D or 3D.
 
     Parameters

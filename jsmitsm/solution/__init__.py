@@ -1,4 +1,4 @@
-"""From a problem to an answer: solve, Newton, error estimate, flags, factorize.
+"""From a problem to an answer: solve, Newton's method, error estimate, flags.
 
 Imports everything before it.
 """

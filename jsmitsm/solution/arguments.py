@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal, TypeAlias, TypedDict, get_args
 
 import numpy as np
 
@@ -10,13 +10,29 @@ from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.cloud.neighbours import Stencils
 from jsmitsm.discretization.layout import Discretization, discretize
 from jsmitsm.equation.problem import Problem
-from jsmitsm.linear.linsolve import SOLVERS
+from jsmitsm.linear.linsolve import SOLVERS, Solver
 from jsmitsm.particle.kernels import Kernel
 from jsmitsm.runtime.errors import refuse_masked
 from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.taylor.multi_indices import HIGHEST
 
-METHODS = ("I", "II", "III", "S", "SSPH")
+Method: TypeAlias = Literal["I", "II", "III", "S", "SSPH"]
+"""What ``method`` may be, a type for annotations."""
+Formulation: TypeAlias = Literal["auto", "loo", "lsq"]
+"""What ``formulation`` may be, a type for annotations."""
+METHODS, FORMULATIONS = get_args(Method), get_args(Formulation)
+
+
+class SolveOptions(TypedDict, total=False):
+    """Options of :func:`jsmitsm.solve` that others pass on to it."""
+
+    method: Method
+    order: int
+    stencils: Stencils | None
+    basis_terms: int | None
+    formulation: Formulation
+    solver: Solver
+    throw: bool
 
 
 def discretized(
@@ -42,7 +58,7 @@ def check(
     if stencils is not None and not isinstance(stencils, Stencils):
         raise ValueError(f"stencils: expected js.stencils(cloud, size=...), got {type(stencils).__name__}")
     for value, known, name in (
-        (method, METHODS, "method"), (formulation, ("auto", "loo", "lsq"), "formulation"), (solver, SOLVERS, "solver")
+        (method, METHODS, "method"), (formulation, FORMULATIONS, "formulation"), (solver, SOLVERS, "solver")
     ):  # fmt: skip
         if value not in known:
             raise ValueError(f"{name}: {value!r} is none of {', '.join(map(repr, known))}")

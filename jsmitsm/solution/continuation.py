@@ -3,23 +3,38 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.equation.problem import Problem
+from jsmitsm.particle.kernels import Kernel
+from jsmitsm.runtime.arrays import Array, ValueOrFunction
 from jsmitsm.runtime.errors import SolveError
 from jsmitsm.runtime.progress import bar
+from jsmitsm.solution.arguments import SolveOptions
 from jsmitsm.solution.solution import Solution
 from jsmitsm.solution.solve import solve
+
+
+class StageOptions(SolveOptions, total=False):
+    """Options of :func:`jsmitsm.solve` for every stage."""
+
+    kernel: Kernel | None
+
 
 # A stage is halved this often before continuation gives up.
 _HALVINGS = 6
 
 
 def continuation(
-    problem: Callable[[float], Problem], cloud: Cloud, parameters: Sequence[float], *, u0: Any = None, **options: Any
+    problem: Callable[[float], Problem],
+    cloud: Cloud,
+    parameters: Sequence[float] | Array,
+    *,
+    u0: ValueOrFunction | None = None,
+    **options: Unpack[StageOptions],
 ) -> list[Solution]:
     """Solve ``problem(parameter)`` for a sequence of parameters, each from the solution before.
 
@@ -58,7 +73,7 @@ def continuation(
         raise ValueError(
             f"problem: expected a function of the parameter that returns a js.Problem, got {type(problem).__name__}"
         )
-    options = {**options, "throw": True}
+    options["throw"] = True
     with bar("continuation", len(values)) as shown:
         sols = [solve(problem(float(values[0])), cloud, u0=u0, **options)]
         shown.update()

@@ -41,9 +41,10 @@ def error_estimate(fit: Fit, values: Any) -> Any:
     defect = _per_value(high, *high_rows, high_nums, values)
     own = _per_value(low, classes, rows, nums, values)
     free = np.flatnonzero(~low.held.reshape(-1))
-    ratio = own[1].reshape(-1)[free] / defect[1].reshape(-1)[free]
-    xp = jnp if is_traced(ratio) else np
-    ratio = xp.where(xp.isfinite(ratio) & (ratio != 0), ratio, 1.0)
+    mine, theirs = own[1].reshape(-1)[free], defect[1].reshape(-1)[free]
+    xp = jnp if is_traced(mine, theirs) else np
+    known = (mine != 0) & (theirs != 0)
+    ratio = xp.where(known, mine / xp.where(known, theirs, 1.0), 1.0)
     data, r, c = matrix(low, classes, rows)
     x, _ = run.solved(data, r, c, ratio * defect[0].reshape(-1)[free], balanced=False)
     zero = np.zeros(low.held.size)

@@ -15,10 +15,11 @@ from jsmitsm.discretization.layout import Discretization, discretize, table
 from jsmitsm.discretization.least_squares import least_squares_right_side
 from jsmitsm.discretization.leave_one_out import right_side, with_held
 from jsmitsm.equation.problem import Problem
+from jsmitsm.linear.linsolve import Solver
 from jsmitsm.particle.kernels import Kernel
 from jsmitsm.runtime.progress import bar
 from jsmitsm.runtime.tracers import is_traced
-from jsmitsm.solution.arguments import check, discretized
+from jsmitsm.solution.arguments import Formulation, Method, check, discretized
 from jsmitsm.solution.fit import Fit, Recipe
 from jsmitsm.solution.run import Run
 from jsmitsm.solution.solution import Solution
@@ -101,8 +102,9 @@ def _same(x: Any, y: Any) -> bool:
 
 @bar("factorize")
 def factorize(
-    problem: Problem, cloud: Cloud, *, method: str = "S", order: int = 4, kernel: Kernel | None = None,
-    stencils: Stencils | None = None, basis_terms: int | None = None, formulation: str = "auto", solver: str = "auto",
+    problem: Problem, cloud: Cloud, *, method: Method = "S", order: int = 4, kernel: Kernel | None = None,
+    stencils: Stencils | None = None, basis_terms: int | None = None, formulation: Formulation = "auto",
+    solver: Solver = "auto",
 ) -> Factorization:  # fmt: skip
     """Prepare a linear problem for many right-hand sides.
 

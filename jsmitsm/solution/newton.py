@@ -9,9 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jsmitsm.discretization.coefficients import numbers
+from jsmitsm.discretization.coefficients import numbers, slot_series
 from jsmitsm.discretization.held_particles import with_held_expansions
+from jsmitsm.discretization.layout import refuse_jumps
 from jsmitsm.discretization.rows import all_coefficients
+from jsmitsm.equation.branches import FIELD
 from jsmitsm.equation.conditions import sample
 from jsmitsm.runtime.errors import SolveError
 from jsmitsm.runtime.progress import bar
@@ -40,10 +42,21 @@ def newton(run: Run, u0: Any) -> tuple[Any, Any, Any, Any]:
     else:
         with bar("Newton steps") as shown:
             values, taylor, good, steps, rate = _iterate(run, values, taylor, one, shown)
+    _refuse_jumps(run, values, taylor)
     if is_traced(one):
         for _ in range(_repeats(rate)):
             values, taylor = _advance(run, taylor)
     return values, taylor, good, steps
+
+
+def _refuse_jumps(run: Run, values: Any, taylor: Any) -> None:
+    """Refuse jumps that the operator differentiates where they depend on u, as it has come out."""
+    disc, found = run.disc, run.disc.traced.branches
+    if found is None or not found.depends & FIELD:
+        return
+    slots, place = slot_series(disc.rec, found.slots, taylor, 0)[:, 0], (0,) * disc.rec.dim
+    given = [values[:, f] if b == place else slots[k] for k, (f, b) in enumerate(found.slots)]
+    refuse_jumps(disc, run.problem, (jnp if is_traced(given) else np).stack(given))
 
 
 def _repeats(rate: float) -> int:
@@ -87,6 +100,7 @@ def _iterate(
     relative = length / _size(target[0])
     good = bool(relative <= 1e-8)
     if not good:
+        _refuse_jumps(run, target[0], target[1])
         run.fail(
             f"Newton's method did not converge: after {steps} steps the next one would still change u by "
             f"{relative:.1e} of its size; start nearer (u0), approach the parameters in stages (js.continuation), or "

@@ -27,6 +27,9 @@ from jsmitsm.solution.flags import flags
 from jsmitsm.solution.memory import refuse_too_large
 from jsmitsm.solution.statistics import skipped
 
+# What an equation and a condition say of one particle may differ by this part of the solution.
+CONTRADICTION = 1e-6
+
 
 class Run:
     """One call of ``solve``: the discretisation, its options, and what happened."""
@@ -121,7 +124,28 @@ class Run:
         if is_traced(values):
             return values, jnp.isfinite(values).all()
         self.nums, self.values = nums, values
+        self._check_degenerate(nums, values)
         return values, bool(good and np.isfinite(values).all() and not self.failed)
+
+    def _check_degenerate(self, nums: Numbers, values: np.ndarray) -> None:
+        """Where the equation degenerates: conditions that contradict it, and a word on those that repeat it."""
+        found = nums.degenerate
+        if found is None:
+            return
+        if len(found.implied):
+            self.messages.append(
+                f"At {len(found.implied)} particle(s), first {some(found.implied)}, the equation itself says what a "
+                "condition does, as on an axis: the condition was left out."
+            )
+        spread = float(np.abs(values).max(initial=0.0))
+        bad = [i for i, off, slack in found.conflicts if off > (CONTRADICTION + 10.0 * slack) * spread]
+        if bad and np.isfinite(spread):
+            self.fail(
+                f"the equation at {len(bad)} particle(s), first {some(bad)}, where its leading coefficient vanishes, "
+                "says something of u by itself, and the condition or the source there contradicts it; correct them, or "
+                "give js.free() where the equation needs no condition",
+                bad,
+            )
 
     def assembled(self, nums: Numbers, parts: list[Any] | None = None) -> tuple[Any, Any, Any, Any]:
         """The global system: entries of the matrix, their rows and columns, and the right-hand side.
@@ -131,6 +155,13 @@ class Run:
         clock, disc = time.perf_counter, self.disc
         start = clock()
         self._forget()
+        if nums.degenerate is not None and len(nums.degenerate.empty):
+            at = nums.degenerate.empty
+            self.fail(
+                f"the equation says nothing at {len(at)} particle(s), first {some(at)}: all its coefficients vanish "
+                "there and around; hold their values (js.fix), or leave that part out of the cloud",
+                at,
+            )
         if disc.cut_off:
             self.messages.append(
                 f"The supports of at least {len(disc.cut_off)} particle(s), first {some(disc.cut_off)}, reach outside "

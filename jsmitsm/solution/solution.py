@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 import jax
@@ -11,6 +11,7 @@ import numpy as np
 
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.cloud.quadrature import quadrature
+from jsmitsm.runtime.arrays import Array, ArrayLike, ValueOrFunction
 from jsmitsm.runtime.errors import SolveError
 from jsmitsm.runtime.tracers import frozen, is_traced, owned
 from jsmitsm.solution.estimate import error_estimate
@@ -65,8 +66,8 @@ class Solution:
         self._recipe: Recipe = recipe
         self._fit = fit  # a pytree with a method .coefficients(values) and friends
         self._fitted = fitted  # (N, F, K) or None
-        self.converged = converged
-        self.iterations = iterations
+        self.converged: bool | jax.Array = converged
+        self.iterations: int | jax.Array = iterations
         self.stats: dict[str, Any] = stats
         self._report: Report | None = report
         self._found: list[str] | None = None  # what the report said
@@ -84,7 +85,7 @@ class Solution:
         return self._recipe.order
 
     @property
-    def u(self) -> Any:
+    def u(self) -> Array:
         """Values (N,) at the particles, in the cloud's order; (N, F) for a system."""
         return self._values[..., 0] if self._recipe.fields == 1 else self._values
 
@@ -99,7 +100,7 @@ class Solution:
             )
 
     @property
-    def coefficients(self) -> Any:
+    def coefficients(self) -> Array:
         """Taylor coefficients d^a u / a!, (N, K), ordered as :func:`jsmitsm.multi_indices`; (N, K, F) for a system."""
         fitted = self._taylor
         return fitted[:, 0] if self._recipe.fields == 1 else jnp.swapaxes(fitted, 1, 2)
@@ -115,7 +116,7 @@ class Solution:
             self._fitted = frozen(fitted)
         return self._fitted
 
-    def __call__(self, points: Any, *, blend: bool = False, outside: str = "nan") -> Any:
+    def __call__(self, points: ArrayLike, *, blend: bool = False, outside: str = "nan") -> jax.Array:
         """Values (M,) at ``points`` (M, D), (M, F) for a system.
 
         Each point takes the polynomial of its nearest particle, or with ``blend`` a smooth average
@@ -130,7 +131,7 @@ class Solution:
         """
         return self.derivative(points, (0,) * self.cloud.dim, blend=blend, outside=outside)
 
-    def grad(self, points: Any, *, blend: bool = False, outside: str = "nan") -> Any:
+    def grad(self, points: ArrayLike, *, blend: bool = False, outside: str = "nan") -> jax.Array:
         """Gradients (M, D) at ``points`` (M, D), (M, F, D) for a system; ``blend`` and ``outside`` as for values.
 
         Raises ValueError for points of another shape, NaN or infinite ones.
@@ -139,8 +140,8 @@ class Solution:
         return jnp.stack([self.derivative(points, b, blend=blend, outside=outside) for b in unit], axis=-1)
 
     def derivative(
-        self, points: Any, multi_index: tuple[int, ...], *, blend: bool = False, outside: str = "nan"
-    ) -> Any:
+        self, points: ArrayLike, multi_index: Sequence[int], *, blend: bool = False, outside: str = "nan"
+    ) -> jax.Array:
         """The derivative d^b u at ``points`` (M, D), b = ``multi_index``, |b| at most the order: (M,) or (M, F).
 
         With ``blend`` the polynomials' derivatives are averaged; ``outside`` as for values. Raises ValueError for
@@ -161,7 +162,7 @@ class Solution:
         values = values if inside is None else jnp.where(inside[:, None], values, jnp.nan)
         return values[:, 0] if self._recipe.fields == 1 else values
 
-    def integral(self, group: str | None = None) -> Any:
+    def integral(self, group: str | None = None) -> jax.Array:
         """The integral of u over a boundary group, or without a name over the domain: a scalar or (F,).
 
         That over the domain has the order of the solution, on curved domains too; see :func:`jsmitsm.quadrature`.
@@ -178,7 +179,7 @@ class Solution:
         points, weights, _ = quadrature(self.cloud, group, self.order)
         return jnp.tensordot(weights, self(points, outside="extrapolate"), axes=1)
 
-    def flux(self, group: str, conductivity: Any = 1.0) -> Any:
+    def flux(self, group: str, conductivity: ValueOrFunction = 1.0) -> jax.Array:
         """The integral of conductivity n . grad u over a boundary group, n outward: a scalar or (F,).
 
         conductivity : a number, or a function of one point x (D,).
@@ -194,7 +195,7 @@ class Solution:
         slope = jnp.einsum("q...d,qd->q...", self.grad(points, outside="extrapolate"), normals)
         return jnp.tensordot(weights * conductivity, slope, axes=1)
 
-    def error_estimate(self) -> Any:
+    def error_estimate(self) -> Array:
         """Estimated error |u - u_exact| at every particle, (N,) or (N, F), by defect correction.
 
         Computed when asked for: one more assembly at order p + 2 and one solve with the kept factors.
@@ -235,7 +236,7 @@ class Solution:
         large = f"The estimated error is {self._share:.0%} of the solution: refine the cloud, or change the order."
         return [*(self._found or []), *([] if self._share <= LARGE else [large])]
 
-    def condition_numbers(self) -> tuple[Any, float]:
+    def condition_numbers(self) -> tuple[np.ndarray, float]:
         """The condition number (N,) of every particle's moment matrix, and an estimate of the global system's.
 
         The matrices are those with rows and columns scaled to about one, so that units do not count.

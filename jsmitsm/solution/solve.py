@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import time
-from typing import Any
 
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.cloud.neighbours import Stencils
 from jsmitsm.discretization.coefficients import numbers
 from jsmitsm.discretization.layout import discretize, table
 from jsmitsm.equation.problem import Problem
+from jsmitsm.linear.linsolve import Solver
 from jsmitsm.particle.kernels import Kernel
+from jsmitsm.runtime.arrays import ValueOrFunction
 from jsmitsm.runtime.progress import bar
 from jsmitsm.runtime.tracers import is_traced
-from jsmitsm.solution.arguments import check
+from jsmitsm.solution.arguments import Formulation, Method, check
 from jsmitsm.solution.fit import Fit, Recipe
 from jsmitsm.solution.newton import newton
 from jsmitsm.solution.run import Run
@@ -25,14 +26,14 @@ def solve(
     problem: Problem,
     cloud: Cloud,
     *,
-    method: str = "S",
+    method: Method = "S",
     order: int = 4,
     kernel: Kernel | None = None,
     stencils: Stencils | None = None,
     basis_terms: int | None = None,
-    formulation: str = "auto",
-    solver: str = "auto",
-    u0: Any = None,
+    formulation: Formulation = "auto",
+    solver: Solver = "auto",
+    u0: ValueOrFunction | None = None,
     throw: bool = True,
 ) -> Solution:
     """Solve ``problem`` on ``cloud``.

@@ -1,4 +1,4 @@
-"""Truncated Taylor arithmetic: multi-indices, series, a rule for every primitive, jets of traced functions.
+"""Truncated Taylor series: their arithmetic, a rule for every JAX operation, jets of functions.
 
 Imports runtime.
 """

@@ -1,4 +1,4 @@
-"""The choice of a kernel by gradients.
+"""The kernel that suits a problem, found by gradients.
 
 Imports solution and what stands before it.
 """

@@ -7,9 +7,9 @@ only for the very numbers they were tuned to.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal, TypeAlias, Unpack
 
 import jax
 import numpy as np
@@ -17,16 +17,25 @@ import numpy as np
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.equation.problem import Problem
 from jsmitsm.particle.kernels import Kernel
+from jsmitsm.runtime.arrays import ArrayLike, ValueOrFunction
 from jsmitsm.runtime.progress import bar
 from jsmitsm.runtime.tracers import is_traced
-from jsmitsm.solution.arguments import check
+from jsmitsm.solution.arguments import SolveOptions, check
 from jsmitsm.solution.solution import Solution
 from jsmitsm.solution.solve import solve
 from jsmitsm.tuning.descent import Descent
 from jsmitsm.tuning.objective import Objective
 from jsmitsm.tuning.parameter_maps import ParameterMap
 
-OPTIONS = ("method", "order", "stencils", "basis_terms", "formulation", "solver", "u0", "throw")
+
+class TuneOptions(SolveOptions, total=False):
+    """Options of :func:`jsmitsm.solve` for every solve of the search."""
+
+    u0: ValueOrFunction | None
+
+
+OPTIONS = tuple(TuneOptions.__annotations__)
+Parameter: TypeAlias = Literal["h", "d", "params"]
 
 
 @dataclass
@@ -62,13 +71,13 @@ def tune(
     cloud: Cloud,
     kernel: Kernel,
     *,
-    objective: str | Callable[[Solution], Any] = "estimate",
-    parameters: tuple[str, ...] = ("h", "d"),
+    objective: Literal["estimate"] | Callable[[Solution], Any] = "estimate",
+    parameters: Parameter | Sequence[Parameter] = ("h", "d"),
     optimizer: Any = None,
     steps: int = 50,
     progress: bool = True,
-    groups: Any = None,
-    **solve_options: Any,
+    groups: ArrayLike | None = None,
+    **solve_options: Unpack[TuneOptions],
 ) -> TuneResult:
     """Tune the parameters of a kernel by gradient descent.
 
@@ -113,7 +122,7 @@ def tune(
     """
     names = _checked_names(kernel, parameters)
     _check_input(problem, cloud, kernel, objective, optimizer, steps, solve_options)
-    options = {"method": "S", "order": 4, **solve_options}
+    options: dict[str, Any] = {"method": "S", "order": 4, **solve_options}
     space = ParameterMap(kernel, names, _checked_groups(groups, cloud, names))
     with bar("tune", steps, progress) as shown:
         scored = Objective(problem, cloud, kernel, objective, options)

@@ -117,7 +117,7 @@ def test_corners_are_particles_with_bisectors(built):
 
 @pytest.mark.parametrize("make", ["sdf", "polygon"])
 def test_at_corners_between_groups_the_normal_is_that_of_the_own_side(make):
-    """A flux on a side holds to its end: with bisectors at its corners u would be 3 % wrong, and no flag would say so."""
+    """A flux on a side holds to its end: with bisectors at its corners u would be 3 % wrong, and no flag say so."""
     groups = {"flux": lambda x: x[:, 0] < 1e-9, "held": lambda x: x[:, 0] > -1}
     square = [(0, 0), (1, 0), (1, 1), (0, 1)]
     cloud = (from_polygon(square, 0.1, groups=groups) if make == "polygon"
@@ -130,7 +130,7 @@ def test_at_corners_between_groups_the_normal_is_that_of_the_own_side(make):
 
 
 def test_edges_between_groups_in_space_and_on_curved_sides():
-    """The flat end of a cylinder against its wall: either group has its own normals on the rim, the wall's are curved."""
+    """The flat end of a cylinder against its wall: either group has its own normals on the rim, the wall is curved."""
     pipe = sdf.cylinder((0, 0, 0), (0, 0, 1), 0.5)
     ends = lambda x: np.abs(x[:, 2] - 0.5) > 0.5 - 1e-9
     wall = lambda x: np.linalg.norm(x[:, :2], axis=1) > 0.5 - 1e-9

@@ -9,14 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jsmitsm.linear import backends
-from jsmitsm.linear import solver_choice
-from jsmitsm.linear import factor_cache
-from jsmitsm.linear import linsolve
-from jsmitsm.linear import sparse
-from jsmitsm.runtime.errors import SolveError
+from jsmitsm.linear import backends, factor_cache, linsolve, solver_choice, sparse
 from jsmitsm.linear.linsolve import SingularMatrix, factor, factorisations, solve
 from jsmitsm.linear.ordering import nested_dissection
+from jsmitsm.runtime.errors import SolveError
 
 BACKENDS = ["dense", "sparse", "iterative"]
 

@@ -18,7 +18,10 @@ def plain(x, scale, index, power):
     return {"all": jnp.sin(scale * x[index]) ** power, "scale": scale**2, "index": index + 1}
 
 
-def whole(x, scale, index=np.array([2, 0, 1]), power=3):
+INDEX = np.array([2, 0, 1])
+
+
+def whole(x, scale, index=INDEX, power=3):
     return called(plain, {"power": power}, {"x": x, "scale": scale, "index": index}, OPTIONS)
 
 
@@ -47,7 +50,8 @@ TRANSFORMS = {
     "grad of grad": lambda f: jax.grad(lambda s: jax.grad(lambda x: f({**X, "scale": x}))(s) ** 2)(1.5),
     "vmap": lambda f: jax.vmap(lambda s: f({**X, "scale": s}))(jnp.arange(3.0)),
     "vmap of grad": lambda f: jax.vmap(jax.grad(lambda s: f({**X, "scale": s})))(jnp.arange(3.0)),
-    "grad of vmap": lambda f: jax.grad(lambda x: jnp.sum(jax.vmap(lambda s: f({"x": x, "scale": s}))(jnp.arange(3.0))))(X["x"]),
+    "grad of vmap": lambda f: jax.grad(
+        lambda x: jnp.sum(jax.vmap(lambda s: f({"x": x, "scale": s}))(jnp.arange(3.0))))(X["x"]),
     "jit": lambda f: jax.jit(f)(X),
     "jit of grad": lambda f: jax.jit(jax.grad(f))(X),
     "grad of jit": lambda f: jax.grad(jax.jit(f))(X),
@@ -87,7 +91,8 @@ def test_a_result_that_does_not_move_has_no_derivative():
     """Otherwise what follows would be differentiated in vain."""
     arguments = {"index": np.array([0]), "scale": 1.5, "x": X["x"]}
     tree = jax.tree.structure(arguments)
-    result = whole_program._whole(plain, (("power", 3),), tree, OPTIONS, False).result(whole_program._avals(arguments.values()))
+    program = whole_program._whole(plain, (("power", 3),), tree, OPTIONS, False)
+    result = program.result(whole_program._avals(arguments.values()))
     names = sorted(plain(*(arguments[k] for k in ("x", "scale", "index")), 3))
     reached = {name: [names[k] for k in result.reached([k])] for k, name in enumerate(arguments)}
     assert reached == {"index": ["all"], "scale": ["all", "scale"], "x": ["all"]}

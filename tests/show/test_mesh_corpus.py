@@ -1,4 +1,4 @@
-"""Small meshes, one for each thing that can be wrong in a file, and what must come of it: right, or refused in words."""
+"""Small meshes, one for each thing that can be wrong in a file, and what must come of it: right, or refused."""
 
 import pickle
 
@@ -31,11 +31,14 @@ def grown(kind, points, cells, bend=lambda x: x):
     base, count = kind.rstrip("0123456789"), int(kind.lstrip("abcdefghijklmnopqrstuvwxyz"))
     edges = {"triangle": [(0, 1), (1, 2), (2, 0)], "quad": [(0, 1), (1, 2), (2, 3), (3, 0)],
              "tetra": [(0, 1), (1, 2), (2, 0), (0, 3), (1, 3), (2, 3)],
-             "hexahedron": [(0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7)],
+             "hexahedron": [(0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4),
+                            (0, 4), (1, 5), (2, 6), (3, 7)],
              "wedge": [(0, 1), (1, 2), (2, 0), (3, 4), (4, 5), (5, 3), (0, 3), (1, 4), (2, 5)],
              "pyramid": [(0, 1), (1, 2), (2, 3), (3, 0), (0, 4), (1, 4), (2, 4), (3, 4)]}[base]  # fmt: skip
-    faces = {"hexahedron27": [(0, 4, 7, 3), (1, 2, 6, 5), (0, 1, 5, 4), (2, 3, 7, 6), (0, 1, 2, 3), (4, 5, 6, 7), range(8)],
-             "wedge18": [(0, 1, 4, 3), (1, 2, 5, 4), (2, 0, 3, 5)], "pyramid14": [(0, 1, 2, 3)], "quad9": [range(4)]}.get(kind, [])  # fmt: skip
+    faces = {"hexahedron27": [(0, 4, 7, 3), (1, 2, 6, 5), (0, 1, 5, 4), (2, 3, 7, 6), (0, 1, 2, 3), (4, 5, 6, 7),
+                              range(8)],
+             "wedge18": [(0, 1, 4, 3), (1, 2, 5, 4), (2, 0, 3, 5)], "pyramid14": [(0, 1, 2, 3)],
+             "quad9": [range(4)]}.get(kind, [])  # fmt: skip
     points, known, out = [*map(tuple, points)], {}, []
     for cell in cells:
         row = list(cell)
@@ -79,7 +82,7 @@ def cubes(kind):
 @pytest.mark.parametrize("kind", ["tetra10", "hexahedron20", "hexahedron27", "wedge15", "wedge18", "pyramid13",
                                   "pyramid14"])  # fmt: skip
 def test_all_nodes_of_solids_of_second_order(kind, shuffled):
-    """Nodes on the faces of a cube are its boundary, with its normals; in whatever order a format has the middle ones."""
+    """Nodes on the faces of a cube are its boundary, with its normals, in whatever order a format has middle ones."""
     mesh = grown(kind, *cubes(kind.rstrip("0123456789")))
     if shuffled:
         cells = mesh.cells[0].data
@@ -135,7 +138,8 @@ def test_a_poisson_problem_on_twenty_node_bricks():
 def test_middle_nodes_out_of_place_are_told():
     mesh = grown("triangle6", SQUARE, HALVES.tolist())
     mesh.points[mesh.cells[0].data[0, 3]] = [0.2, 3.0]
-    with pytest.raises(ValueError, match=r"mesh: the middle nodes of 'triangle6' cell 0, nodes \[0, 1, 2.*write the mesh"):
+    pattern = r"mesh: the middle nodes of 'triangle6' cell 0, nodes \[0, 1, 2.*write the mesh"
+    with pytest.raises(ValueError, match=pattern):
         from_mesh(mesh)
 
 
@@ -150,7 +154,8 @@ def parts(first, second):
 PYRAMID = np.vstack([CUBE, [0.5, 0.5, 2.0]])
 WRONG = {
     "hanging node": (
-        meshio.Mesh([*SQUARE, [2, 0], [2, 1], [2, 0.5], [1, 0.5]], [("quad", [[0, 1, 2, 3], [1, 4, 6, 7], [7, 6, 5, 2]])]),
+        meshio.Mesh([*SQUARE, [2, 0], [2, 1], [2, 0.5], [1, 0.5]],
+                    [("quad", [[0, 1, 2, 3], [1, 4, 6, 7], [7, 6, 5, 2]])]),
         r"the nodes \[7\] lie on sides.*\[1, 2\].*hanging nodes.*conforming"),
     "hanging middle": (
         meshio.Mesh([*SQUARE, [1, 0.5], [0.5, 0], [0.5, 1], [0, 0.5], [2, 0], [2, 1], [2, 0.5]],
@@ -169,11 +174,13 @@ WRONG = {
         meshio.Mesh([*SQUARE, [1.5, 0.5]], [("triangle", [[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]])]),
         "lie on the same side of it.*inverted or overlap; untangle"),
     "both diagonals": (
-        meshio.Mesh(SQUARE, [("triangle", [[0, 1, 2], [0, 2, 3], [0, 1, 3], [1, 2, 3]])]), "same side|given twice|2 cells"),
+        meshio.Mesh(SQUARE, [("triangle", [[0, 1, 2], [0, 2, 3], [0, 1, 3], [1, 2, 3]])]),
+        "same side|given twice|2 cells"),
     "three cells at a side": (
         meshio.Mesh([*SQUARE, [0.4, 0.9]], [("triangle", [[0, 1, 2], [0, 2, 3], [0, 2, 4]])]), "belongs to 3 cells"),
     "a flat cell": (
-        meshio.Mesh([*SQUARE, [0.5, 0.5]], [("triangle", [[0, 1, 2], [0, 2, 4]])]), r"without volume.*\[0, 2, 4\].*remove"),
+        meshio.Mesh([*SQUARE, [0.5, 0.5]], [("triangle", [[0, 1, 2], [0, 2, 4]])]),
+        r"without volume.*\[0, 2, 4\].*remove"),
     "a flat cell inside": (
         meshio.Mesh([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0.5, 0.5, 1], [0.5, 0.5, -1]],
                     [("tetra", [[0, 1, 2, 3], [0, 1, 2, 4], [0, 2, 3, 4], [0, 1, 3, 5], [1, 2, 3, 5]])]),
@@ -186,12 +193,16 @@ WRONG = {
         r"touches itself at the nodes \[2\]"),
     "bricks that touch along an edge": (
         meshio.Mesh([*CUBE, *(CUBE[[1, 2, 3, 5, 6, 7]] + [1, 1, 0])],
-                    [("hexahedron", [range(8), [2, 8, 9, 10, 6, 11, 12, 13]])]), r"touches itself at the nodes \[2, 6\]"),
-    "a tent on the plane": (meshio.Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0.1]], [("triangle", [[0, 1, 2]])]), "surface in space"),
+                    [("hexahedron", [range(8), [2, 8, 9, 10, 6, 11, 12, 13]])]),
+        r"touches itself at the nodes \[2, 6\]"),
+    "a tent on the plane": (
+        meshio.Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0.1]], [("triangle", [[0, 1, 2]])]), "surface in space"),
     "another plane": (
-        meshio.Mesh([[0, 0, 0], [1, 0, 0], [0, 0, 1]], [("triangle", [[0, 1, 2]])]), r"axes \[0, 2\]: pass points\[:, \[0, 2\]\]"),
+        meshio.Mesh([[0, 0, 0], [1, 0, 0], [0, 0, 1]], [("triangle", [[0, 1, 2]])]),
+        r"axes \[0, 2\]: pass points\[:, \[0, 2\]\]"),
     "two dimensions": (
-        meshio.Mesh([*SQUARE, [2, 0.5]], [("triangle", HALVES), ("line", [[1, 4]])]), r"'line' cells.*\[1, 4\].*two dimensions"),
+        meshio.Mesh([*SQUARE, [2, 0.5]], [("triangle", HALVES), ("line", [[1, 4]])]),
+        r"'line' cells.*\[1, 4\].*two dimensions"),
     "nodes too many": (meshio.Mesh(SQUARE, [("triangle", [[0, 1, 2, 3]])]), r"shape \(1, 4\).*expected.*\(M, 3\)"),
     "lines on lines": (meshio.Mesh([[0.0], [1], [2], [0.5]], [("line", [[0, 1], [3, 2]])]), "lies in 'line' cell 0"),
     "masked points": (meshio.Mesh(SQUARE, [("triangle", HALVES)]), "its points: 1 of its 8 entries are masked"),
@@ -224,7 +235,7 @@ def test_harmless_cells_are_read():
     assert len(from_mesh(parts(SQUARE, SQUARE + [1.01, 0]))) == 8
     rounded = np.pad(SQUARE, ((0, 0), (0, 1))) + 1e-10 * np.arange(12).reshape(4, 3)
     assert len(from_mesh(meshio.Mesh(rounded, [("triangle", HALVES)]))) == 4
-    x, y, z = np.meshgrid(*[np.linspace(0, 1, 5)] * 2, [0, 1e-5], indexing="ij")  # its sides are warped by more than that
+    x, y, z = np.meshgrid(*[np.linspace(0, 1, 5)] * 2, [0, 1e-5], indexing="ij")  # its sides are warped by more
     shell = np.stack([x, y, z + 0.2 * np.sin(5 * x) * np.cos(4 * y)], axis=-1).reshape(-1, 3)
     at = np.arange(50).reshape(5, 5, 2)
     ring = [at[:-1, :-1], at[1:, :-1], at[1:, 1:], at[:-1, 1:]]
@@ -265,7 +276,8 @@ def test_every_side_keeps_a_node():
     """"corner" has the side between 0 and 1 alone, both claimed before; it keeps one. A copy of a side is told."""
     cloud = from_mesh(tagged({"left": [[0, 3], [3, 6]], "bottom": [[0, 1], [1, 2]], "corner": [[0, 1]]}))
     assert names(cloud) == {"interior": [4], "left": [0, 3, 6], "bottom": [2], "corner": [1], "boundary": [5, 7, 8]}
-    cloud = from_mesh(tagged({"left": [[0, 3], [3, 6]], "bottom": [[0, 1], [1, 2]], "low": [[3, 0]], "right": [[2, 5]]}))
+    sides = {"left": [[0, 3], [3, 6]], "bottom": [[0, 1], [1, 2]], "low": [[3, 0]], "right": [[2, 5]]}
+    cloud = from_mesh(tagged(sides))
     assert all(len(cloud.groups[name]) for name in ("left", "bottom", "low", "right"))
     with pytest.raises(ValueError, match=r"the group 'all' would have no node: .*belong to 'a', 'b'; .*tags="):
         from_mesh(tagged({"a": [[0, 1], [1, 2], [2, 5], [5, 8]], "b": [[8, 7], [7, 6], [6, 3], [3, 0]],
@@ -282,7 +294,8 @@ def test_a_list_of_names_chooses_groups_and_who_is_first():
         from_mesh(mesh, tags="gmsh:phisical")
     with pytest.raises(ValueError, match="tags: 'left' is none .*chosen by a list"):
         from_mesh(mesh, tags="left")
-    loose = meshio.Mesh([*NINE, [5, 5]], [("quad", QUADS)], point_sets={"anchor": np.array([9]), "left": np.array([0, 3])})
+    sets = {"anchor": np.array([9]), "left": np.array([0, 3])}
+    loose = meshio.Mesh([*NINE, [5, 5]], [("quad", QUADS)], point_sets=sets)
     assert names(from_mesh(loose))["left"] == [0, 3]
     with pytest.raises(ValueError, match="tags: the group 'anchor' has no node in the domain"):
         from_mesh(loose, tags=["left", "anchor"])
@@ -311,8 +324,8 @@ def test_materials_are_cell_groups():
                        field_data={"steel": [1, 2], "glass": [2, 2], "time": [0.5]})  # fmt: skip
     cloud = from_mesh(mesh)
     wanted = {"steel": [0, 1, 3, 4, 6, 7], "glass": [1, 2, 4, 5, 7, 8]}
-    for again in (cloud, pickle.loads(pickle.dumps(cloud)), jax.tree.map(lambda x: x, cloud), jax.jit(lambda c: c)(cloud),
-                  cloud.replace(points=cloud.points + 1)):  # fmt: skip
+    for again in (cloud, pickle.loads(pickle.dumps(cloud)), jax.tree.map(lambda x: x, cloud),
+                  jax.jit(lambda c: c)(cloud), cloud.replace(points=cloud.points + 1)):  # fmt: skip
         assert {k: v.tolist() for k, v in again.cell_groups.items()} == wanted
         assert names(again) == names(cloud) == {"interior": [4], "boundary": [0, 1, 2, 3, 5, 6, 7, 8]}
     assert "cell groups {steel: 6, glass: 6}" in repr(cloud)
@@ -423,10 +436,12 @@ def su2(gap=" ", index=True, marks=(("hot wall", [(0, 1), (1, 2)]), ("3", [(2, 5
     lines = ["% a comment", head, "NELEM= 4"]
     lines += [gap.join(map(str, [9, *quad, *([k] if index else [])])) for k, quad in enumerate(QUADS)]
     lines += ["NPOIN= 9"]
-    lines += [gap.join([f"{0.1 * x:.3f}", f"{0.1 * y:.3f}", *([str(k)] if index else [])]) for k, (x, y) in enumerate(NINE)]
+    for k, (x, y) in enumerate(NINE):
+        lines.append(gap.join([f"{0.1 * x:.3f}", f"{0.1 * y:.3f}", *([str(k)] if index else [])]))
     lines += [f"NMARK= {len(marks)}"]
     for name, sides in marks:
-        lines += [f"MARKER_TAG= {name}", f"MARKER_ELEMS= {len(sides)}", *(gap.join(map(str, [3, *side])) for side in sides)]
+        lines += [f"MARKER_TAG= {name}", f"MARKER_ELEMS= {len(sides)}"]
+        lines += [gap.join(map(str, [3, *side])) for side in sides]
     return "\n".join(lines) + "\n"
 
 
@@ -465,8 +480,8 @@ def deck(*cards, nset="Nall", kind="CPS4"):
     """A plate in an Abaqus file; its nodes and elements are numbered 10, 20, ..."""
     nodes = [f"{10 * k + 10}, {x}, {y}, 0." for k, (x, y) in enumerate(NINE)]
     quads = [f"{10 * k + 10}, " + ", ".join(str(10 * n + 10) for n in quad) for k, quad in enumerate(QUADS)]
-    return "\n".join(["*HEADING", "a plate", f"*NODE, NSET={nset}", *nodes, f"*ELEMENT, TYPE={kind}, ELSET=Eall", *quads,
-                      *cards]) + "\n"  # fmt: skip
+    return "\n".join(["*HEADING", "a plate", f"*NODE, NSET={nset}", *nodes, f"*ELEMENT, TYPE={kind}, ELSET=Eall",
+                      *quads, *cards]) + "\n"  # fmt: skip
 
 
 def test_a_set_of_all_nodes_is_no_side(tmp_path):
@@ -494,8 +509,9 @@ def test_a_brick_of_calculix(tmp_path):
     nodes = [f"{k + 1}, {x}, {y}, {z}" for k, (x, y, z) in enumerate(mesh.points)]
     numbers = [str(n + 1) for n in mesh.cells[0].data[0]]
     for kind in ("C3D20", "C3D20R", "DC3D20"):
-        lines = ["*NODE, NSET=NALL", *nodes, f"*ELEMENT, TYPE={kind}, ELSET=EALL", "1, " + ", ".join(numbers[:11]) + ",",
-                 ", ".join(numbers[11:]), "*SURFACE, NAME=top", "EALL, S2", "*SURFACE, NAME=front", "1, S3"]  # fmt: skip
+        lines = ["*NODE, NSET=NALL", *nodes, f"*ELEMENT, TYPE={kind}, ELSET=EALL",
+                 "1, " + ", ".join(numbers[:11]) + ",", ", ".join(numbers[11:]),
+                 "*SURFACE, NAME=top", "EALL, S2", "*SURFACE, NAME=front", "1, S3"]  # fmt: skip
         cloud = from_mesh(write(tmp_path, "a.inp", "\n".join(lines)))
         assert len(cloud) == 20 and (cloud.points[cloud.groups["top"]][:, 2] == 1).all()
         assert len(cloud.groups["top"]) == 8 and len(cloud.groups["front"]) == 5 and len(cloud.groups["boundary"]) == 7
@@ -550,7 +566,8 @@ def test_files_of_another_kind_than_their_name(tmp_path):
     for name in ("a.su2", "a.inp", "a.vtk", "a.vtu", "a.xdmf", "a.mesh", "a.txt"):
         with pytest.raises(ValueError, match="mesh: cannot read.*expected a whole file"):
             from_mesh(write(tmp_path, name, text))
-    for junk in (b"\x00" * 50, bytes(range(256)), "\u00e4\u20ac".encode() * 9, b"*NODE\n\xff\xfe\n", b"NDIME= 2\nNPOIN= x\n"):
+    words = "\u00e4\u20ac".encode() * 9
+    for junk in (b"\x00" * 50, bytes(range(256)), words, b"*NODE\n\xff\xfe\n", b"NDIME= 2\nNPOIN= x\n"):
         for name in ("a.su2", "a.inp", "a.vtk", "a.msh"):
             path = tmp_path / name
             path.write_bytes(junk)

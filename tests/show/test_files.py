@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 import jsmitsm as js
-from jsmitsm.show.files import from_csv, from_mesh, from_shapely, to_csv, to_mesh, to_pandas, to_xarray
 from jsmitsm.cloud.shapes import from_polygon
 from jsmitsm.cloud.triangulation import simplices
+from jsmitsm.show.files import from_csv, from_mesh, from_shapely, to_csv, to_mesh, to_pandas, to_xarray
 
 meshio = pytest.importorskip("meshio")
 
@@ -87,7 +87,8 @@ def test_gmsh_file_with_physical_names(tmp_path):
         "bottom": [[0, 0], [1, 0], [2, 0]],
         "boundary": [[0, 1], [0, 2], [1, 2]],
     }
-    assert {k: cloud.points[v].tolist() for k, v in cloud.cell_groups.items() if k != "all"} == {"inner": [[0, 1], [1, 1]]}
+    inside = {k: cloud.points[v].tolist() for k, v in cloud.cell_groups.items() if k != "all"}
+    assert inside == {"inner": [[0, 1], [1, 1]]}
     assert len(cloud.cell_groups["all"]) == 9
     np.testing.assert_allclose(cloud.normals[cloud.groups["bottom"]][1], [0, -1])
     # In memory "right" is named first.
@@ -95,7 +96,7 @@ def test_gmsh_file_with_physical_names(tmp_path):
 
 
 def ring():
-    """A quarter of a ring between the radii 1 and 2, its four sides tagged; the arcs first, so that corners are theirs."""
+    """A quarter of a ring between the radii 1 and 2, its four sides tagged; the arcs first: the corners are theirs."""
     radius, angle = np.linspace(1, 2, 9), np.linspace(0, np.pi / 2, 17)
     points = np.array([[r * np.cos(t), r * np.sin(t), 0] for r in radius for t in angle])
     at = np.arange(points.shape[0]).reshape(9, 17)
@@ -118,7 +119,7 @@ def test_at_corners_between_groups_the_normal_is_that_of_the_own_side():
 
 
 def test_a_ring_under_pressure_from_a_mesh():
-    """Lame's thick-walled tube in plane strain: u = a r + b / r, pressure inside, nothing outside, two planes of symmetry."""
+    """Lame's thick-walled tube in plane strain: u = a r + b / r, pressure inside alone, two planes of symmetry."""
     mu = lam = 1.0
     pressure, cloud = 0.3, from_mesh(ring())
 
@@ -209,7 +210,8 @@ def moved(value):
     (CORNERS[:, :1], [FAN], {}, r"mesh: its points have shape \(5, 1\).*D at least 2"),
     (CORNERS * 1e300, [FAN], {}, "coordinates of size 1e.300.*another unit of length"),
     (CORNERS * 1e-300, [FAN], {}, "coordinates of size 1e-300.*another unit of length"),
-    (CORNERS, [("triangle", [[0, 1, 9]])], {}, "nodes from 0 to 9, but there are only the points 0 to 4; write the mesh"),
+    (CORNERS, [("triangle", [[0, 1, 9]])], {},
+     "nodes from 0 to 9, but there are only the points 0 to 4; write the mesh"),
     (CORNERS, [("triangle", [[0, 1, -1]])], {}, "nodes from -1 to 1"),
     (CORNERS, [("triangle", [[0, 1, 1]])], {}, "has a node twice"),
     ([*CORNERS, [0.5, 0.0]], [("triangle", [*FAN[1], [0, 5, 1]])], {}, "cell without volume has the nodes .*remove"),
@@ -218,8 +220,10 @@ def moved(value):
     (CORNERS, [("vertex", [[0]])], {}, "has no cells"),
     (CORNERS, [("line", [[0, 4]])], {}, "1-dimensional but its points"),
     (CORNERS, [("triangle10", [[0, 1, 2, 3, 4, 0, 1, 2, 3, 4]])], {}, "'triangle10' are not understood; save it"),
-    (CORNERS, [FAN, SIDE], {"cell_data": {"mark": [[1.0] * 4, [2.5]]}}, "tags: the cell data 'mark' are no whole numbers"),
-    (CORNERS, [FAN, SIDE], {"cell_data": {"mark": [[1.0] * 4, [np.nan]]}}, "tags: .* no whole numbers; number the sides"),
+    (CORNERS, [FAN, SIDE], {"cell_data": {"mark": [[1.0] * 4, [2.5]]}},
+     "tags: the cell data 'mark' are no whole numbers"),
+    (CORNERS, [FAN, SIDE], {"cell_data": {"mark": [[1.0] * 4, [np.nan]]}},
+     "tags: .* no whole numbers; number the sides"),
     (CORNERS, [FAN, SIDE], {"cell_data": {"mark": [[1] * 4, [2]]}, "field_data": {"interior": np.array([2, 1])}},
      "tagged 'interior'.*rename"),
 ])  # fmt: skip

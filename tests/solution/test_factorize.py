@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import jsmitsm as js
-from jsmitsm.particle import batches
 from jsmitsm.linear import linsolve
+from jsmitsm.particle import batches
 
 SIDES = ("left", "right", "bottom", "top")
 CLOUD = js.rectangle((0, 0), (1, 1), (17, 17), jitter=0.2)

@@ -97,8 +97,9 @@ def test_a_kernel_is_a_pytree_of_h_and_d(kind):
 
 
 def test_one_smoothing_length_per_particle():
-    kernel = js.Gaussian(h=np.array([0.1, 0.2]), d=2.0)
-    assert kernel.at(1).h == 0.2 and kernel.at(1).d == 2.0
+    for given in (np.array([0.1, 0.2]), [0.1, 0.2], jnp.array([0.1, 0.2])):
+        kernel = js.Gaussian(h=given, d=2.0)
+        assert kernel.at(1).h == 0.2 and kernel.at(1).d == 2.0 and len(jax.tree.leaves(kernel)) == 2
     single = js.Gaussian(h=0.1, d=2.0)
     assert single.at(5) is single
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import jsmitsm as js
-from jsmitsm.linear import backends
 from jsmitsm.discretization import sharing
+from jsmitsm.linear import backends
 from jsmitsm.runtime import progress
 
 pytest.importorskip("tqdm")

@@ -8,8 +8,8 @@ import pytest
 import jsmitsm.equation.tracing as trace_module
 from jsmitsm.equation.field import local_field
 from jsmitsm.equation.operators import divergence, grad, hessian, laplacian, partial
-from jsmitsm.taylor.multi_indices import count, multi_indices
 from jsmitsm.equation.tracing import trace
+from jsmitsm.taylor.multi_indices import count, multi_indices
 
 NU = 0.25
 

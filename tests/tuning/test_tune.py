@@ -11,9 +11,8 @@ import pytest
 
 import jsmitsm as js
 from jsmitsm.particle import batches
-
-from jsmitsm.tuning import tune as room
 from jsmitsm.tuning import objective as score_room
+from jsmitsm.tuning import tune as room
 from jsmitsm.tuning.objective import Objective, hand_kernel, reference
 
 N = 15
@@ -144,7 +143,9 @@ def test_the_reference_is_the_best_of_its_candidates(function, order):
     posed, hand = line(exact=function), hand_kernel(cloud.points)
     there = np.array([float(function(x)) for x in cloud.points])
     kernels = (hand, hand.replace(h=0.8 * hand.h))
-    made = {(p, k): js.solve(posed, cloud, order=p, kernel=kernel).u for p in (6, 4) for k, kernel in enumerate(kernels)}
+    made = {
+        (p, k): js.solve(posed, cloud, order=p, kernel=kernel).u for p in (6, 4) for k, kernel in enumerate(kernels)
+    }
     best = min(made, key=lambda key: np.linalg.norm(made[key] - there))
     chosen, solves = reference(posed, cloud, {"order": 2})
     assert best[0] == order and solves == 4
@@ -223,7 +224,8 @@ def test_a_hopeless_start_is_named():
 
 def test_the_support_stays_inside_given_stencils():
     near = js.stencils(cloud, radius=4.2 * s)
-    found = tuned(js.SuperGaussian(s, 4.0), objective=lambda sol: -sol._fit.kernel.h * sol._fit.kernel.d, steps=8, stencils=near)
+    reach = lambda sol: sol._fit.kernel.h * sol._fit.kernel.d
+    found = tuned(js.SuperGaussian(s, 4.0), objective=lambda sol: -reach(sol), steps=8, stencils=near)
     assert 4.1 * s < found.kernel.h * found.kernel.d <= 4.2 * s * (1 + 1e-6)
     assert any("held inside the given stencils" in m for m in found.messages)
 

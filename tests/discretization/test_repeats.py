@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 import jsmitsm as js
-from jsmitsm.discretization import repeated_stencils as room
 from jsmitsm.cloud.neighbours import nearest
+from jsmitsm.discretization import repeated_stencils as room
 
 exact = lambda x: jnp.sin(2 * x[0]) * jnp.exp(x[1])
 problem = js.Problem(

@@ -144,8 +144,10 @@ def test_even_clouds_have_smaller_stencils_except_at_jumps():
     counts = size(cloud(points))
     assert np.median(counts) == 22 and np.median(counts[abs(points[:, 0] - 0.9) < 0.02]) >= 28
     random = rng.random((400, 2))
-    random[:80] = np.concatenate([np.stack([t, o], 1) for t in [np.linspace(0, 1, 20)] for o in (0 * t, 0 * t + 1)] +
-                                 [np.stack([o, t], 1) for t in [np.linspace(0, 1, 22)[1:-1]] for o in (0 * t, 0 * t + 1)])
+    along, up = np.linspace(0, 1, 20), np.linspace(0, 1, 22)[1:-1]
+    random[:80] = np.concatenate(
+        [np.stack([along, 0 * along + o], 1) for o in (0, 1)] + [np.stack([0 * up + o, up], 1) for o in (0, 1)]
+    )
     assert np.median(size(cloud(random))) >= 28
 
 

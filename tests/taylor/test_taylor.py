@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from jsmitsm.taylor.jets import evaluate, taylor_coefficients
-from jsmitsm.taylor.series import Ring, add, div, mul, variable
 from jsmitsm.taylor.multi_indices import count, degree_of_count, factorial, index_of, multi_indices
+from jsmitsm.taylor.series import Ring, add, div, mul, variable
 
 
 @pytest.mark.parametrize("dim", [1, 2, 3])

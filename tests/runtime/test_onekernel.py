@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 import jsmitsm as js
-from jsmitsm.runtime import whole_program
-from jsmitsm.runtime import one_kernel
+from jsmitsm.runtime import one_kernel, whole_program
 
 needs_one_kernel = pytest.mark.skipif(not one_kernel.available(), reason="this JAX makes no single kernels")
 X = np.array([0.3, -0.4, 1.2])
@@ -40,14 +39,14 @@ def test_constants_and_arguments_that_the_compiler_would_lose(function):
     source = f"""
 import jax; jax.config.update("jax_enable_x64", True)
 import numpy as np
-from tests.test_onekernel import *
+from tests.runtime.test_onekernel import *
 program, made = run({function.__name__}, x=X, unused=np.ones(7))
 want = {function.__name__}(X, np.ones(7))
 assert program.small
 for a, b in zip(made, want, strict=True):
     np.testing.assert_allclose(a, b, rtol=1e-14)
 """
-    done = subprocess.run([sys.executable, "-c", source], capture_output=True, text=True, cwd=Path(__file__).parents[1])
+    done = subprocess.run([sys.executable, "-c", source], capture_output=True, text=True, cwd=Path(__file__).parents[2])
     assert done.returncode == 0, done.stderr[-2000:]
 
 
@@ -72,7 +71,8 @@ def test_the_local_phase_is_one_kernel(method, side, monkeypatch):
     monkeypatch.setattr(whole_program, "Program", Kept)
     whole_program._whole.cache_clear()
     cloud = js.rectangle((0, 0), (1, 1), (side, side), jitter=0.2)
-    js.solve(js.Problem(lambda u, x: (1 + x[0]) * js.laplacian(u)(x) - x[1], held(cloud, 0.0)), cloud, method=method, order=2)
+    posed = js.Problem(lambda u, x: (1 + x[0]) * js.laplacian(u)(x) - x[1], held(cloud, 0.0))
+    js.solve(posed, cloud, method=method, order=2)
     assert any("rows" in p.name for p in made) and all(p.small for p in made if not p.on_host)
 
 
@@ -83,7 +83,8 @@ def held(cloud, value):
 @pytest.mark.parametrize("method", ["I", "II", "III", "S", "SSPH"])
 @pytest.mark.parametrize("dim", [1, 2, 3])
 def test_one_kernel_gives_the_numbers_of_many(method, dim, monkeypatch):
-    cloud = [js.interval(0, 1, 30), js.rectangle((0, 0), (1, 1), (9, 9)), js.box((0, 0, 0), (1, 1, 1), (5, 5, 5))][dim - 1]
+    clouds = js.interval(0, 1, 30), js.rectangle((0, 0), (1, 1), (9, 9)), js.box((0, 0, 0), (1, 1, 1), (5, 5, 5))
+    cloud = clouds[dim - 1]
     exact = lambda x: jnp.sin(jnp.sum(x)) + x[0] ** 2
     posed = js.Problem(
         lambda u, x: js.laplacian(u)(x) + (1 + x[0]) * u(x) - js.laplacian(exact)(x) - (1 + x[0]) * exact(x),

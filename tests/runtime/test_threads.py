@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import jsmitsm as js
-from jsmitsm.particle import batches
 from jsmitsm.discretization import sharing
+from jsmitsm.particle import batches
 from jsmitsm.runtime import threads
 
 SIDES = dict.fromkeys(("left", "right", "bottom", "top"), js.dirichlet(0.0))
