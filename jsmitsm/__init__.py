@@ -10,7 +10,7 @@ from jsmitsm.equation.operators import divergence, grad, hessian, laplacian, par
 from jsmitsm.equation.problem import Condition, Problem, condition, dirichlet, fix, free, neumann, periodic, robin
 from jsmitsm.linear.linsolve import Solver
 from jsmitsm.particle.kernels import Constant, CubicSpline, Gaussian, Kernel, SuperGaussian, Wendland
-from jsmitsm.runtime.errors import SolveError
+from jsmitsm.runtime.errors import SolveError, did_you_mean
 from jsmitsm.runtime.progress import no_progress
 from jsmitsm.solution.arguments import Formulation, Method
 from jsmitsm.solution.factorization import Factorization, factorize
@@ -62,7 +62,8 @@ else:
             return import_module(f"jsmitsm.{_LAZY[name]}.{name}")
         if name in _LAZY:
             return getattr(import_module(f"jsmitsm.{_LAZY[name]}"), name)
-        raise AttributeError(f"module 'jsmitsm' has no attribute {name!r}")
+        known = "" if name.startswith("_") else did_you_mean(name, __all__)
+        raise AttributeError(f"module 'jsmitsm' has no attribute {name!r}{known}")
 
 
 def __dir__() -> list[str]:

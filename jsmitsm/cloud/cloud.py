@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from jsmitsm.runtime.arrays import Array, ArrayLike
-from jsmitsm.runtime.errors import refuse_masked, some
+from jsmitsm.runtime.errors import refuse_masked, short, some
 from jsmitsm.runtime.tracers import frozen, owned
 
 INTERIOR = "interior"
@@ -181,7 +181,7 @@ def _checked_points(points: Any) -> Any:
             array = np.asarray(points)
             if array.dtype.kind not in "fiu":
                 raise TypeError
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             raise ValueError(
                 f"points: expected a real array of shape (N, D), got {type(points).__name__} "
                 "that is not one; pass e.g. np.array([[0.0, 0.0], [1.0, 0.0]])"
@@ -291,7 +291,7 @@ def _checked_normals(normals: Any, points: Any, groups: Groups) -> Any:
         if normals.dtype.kind == "c":
             raise TypeError
         normals = normals.astype(np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise ValueError("normals: expected real numbers, unit vectors that point outward") from None
     normals[groups[INTERIOR]] = np.nan
     length = np.linalg.norm(normals, axis=1)
@@ -382,8 +382,8 @@ def _lattice(lo, hi, shape, jitter, seed, dim=1, names=("lo", "hi", "shape")) ->
 def _checked_corner(value: Any, name: str, dim: int) -> np.ndarray:
     try:
         corner = np.atleast_1d(np.asarray(value, dtype=np.float64))
-    except (TypeError, ValueError):
-        raise ValueError(f"{name}: expected {dim} finite number(s), got {value!r}") from None
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError(f"{name}: expected {dim} finite number(s), got {short(value)}") from None
     if corner.shape != (dim,) or not np.isfinite(corner).all():
-        raise ValueError(f"{name}: expected {dim} finite number(s), got {value!r}")
+        raise ValueError(f"{name}: expected {dim} finite number(s), got {short(value)}")
     return corner

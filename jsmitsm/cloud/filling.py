@@ -10,7 +10,10 @@ import itertools
 from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 
+import jax
 import numpy as np
+
+from jsmitsm.runtime.errors import short
 
 Spacing = Callable[[np.ndarray], np.ndarray]
 SpacingLike = float | Callable[[np.ndarray], Any]
@@ -54,15 +57,19 @@ class Cells(NamedTuple):
 def spacing_function(spacing: Any) -> Spacing:
     """A number or a user's function as a function (M, D) -> (M,) that checks what it returns."""
     if not callable(spacing):
-        value = np.asarray(spacing)
+        value = np.array(None) if isinstance(spacing, jax.core.Tracer) else np.asarray(spacing)
         if value.ndim or value.dtype.kind not in "fiu" or not np.isfinite(value) or value <= 0:
             raise ValueError(
-                f"spacing: expected a positive finite number or a function (M, D) -> (M,), got {spacing!r}"
+                f"spacing: expected a positive finite number or a function (M, D) -> (M,), got {short(spacing)}"
             )
         return lambda x: np.full(len(x), float(value))
 
     def checked(x: np.ndarray) -> np.ndarray:
-        h = np.asarray(spacing(x), dtype=np.float64)
+        given = spacing(x)
+        try:
+            h = np.asarray(given, dtype=np.float64)
+        except (TypeError, ValueError, OverflowError):
+            raise ValueError(f"spacing: the function returned {short(given)}, expected numbers (M,)") from None
         if h.shape != (len(x),):
             raise ValueError(
                 f"spacing: the function returned shape {h.shape} for points of shape {x.shape}, "

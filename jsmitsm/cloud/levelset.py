@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 
 from jsmitsm.cloud import filling
 from jsmitsm.cloud.filling import Spacing
+from jsmitsm.runtime.compiled import fingerprint, kept
+from jsmitsm.runtime.errors import IN_FUNCTIONS, in_words
+from jsmitsm.runtime.jaxprs import inlined
+from jsmitsm.runtime.snapshot import snapshot
 
 _BATCH = 1024  # every call is padded to this size: one compilation per function and dimension
 LEAST = 5.0  # spacings round a boundary component below which its shape is lost
@@ -24,51 +28,23 @@ class Boundary(NamedTuple):
     normals: np.ndarray
 
 
-@functools.partial(jax.jit, static_argnums=0)
-def _value_and_gradient(sdf: Callable, x: jax.Array) -> tuple[jax.Array, jax.Array]:
-    return jax.vmap(jax.value_and_grad(sdf))(x)
+def _value_and_gradient(sdf: ClosedJaxpr, dim: int) -> Callable[[np.ndarray], tuple[jax.Array, jax.Array]]:
+    """Of a batch of points; one program for all functions that record the same."""
+    batch = jax.ShapeDtypeStruct((_BATCH, dim), jnp.float64)
+    closed = jax.make_jaxpr(jax.vmap(jax.value_and_grad(lambda x: jaxpr_as_fun(sdf)(x)[0])))(batch)
+    jaxpr = closed.jaxpr
+    program = kept(("sdf", fingerprint(jaxpr)), lambda: jax.jit(lambda consts, x: inlined(jaxpr, consts, [x])))
+    return lambda x: program(closed.consts, x)
 
 
 class SdfRegion:
     """The part of the box lo, hi where ``sdf`` is negative."""
 
-    def __init__(self, sdf: Callable, lo: np.ndarray, hi: np.ndarray):
+    def __init__(self, sdf: Callable[..., Any], lo: np.ndarray, hi: np.ndarray):
         self.lo, self.hi = lo, hi
         self.size = float((hi - lo).max())
-        try:
-            hash(sdf)
-            self._sdf = sdf
-        except TypeError:
-            self._sdf = lambda x: sdf(x)
-        self._check_shape()
+        self._recorded = _value_and_gradient(_recorded(sdf, len(lo)), len(lo))
         self._check_faces()
-
-    def _check_shape(self) -> None:
-        dim = len(self.lo)
-        if not callable(self._sdf):
-            raise ValueError(f"sdf: expected a function x (D,) -> scalar, got {self._sdf!r}")
-        if jax.dtypes.canonicalize_dtype(np.float64) != np.float64:
-            raise ValueError(
-                "sdf: JAX computes in float32 here, boundary particles to 1e-10 need float64; put "
-                'jax.config.update("jax_enable_x64", True) at the beginning of the program'
-            )
-        try:
-            out = jax.eval_shape(self._sdf, jax.ShapeDtypeStruct((dim,), jnp.float64))
-        except (TypeError, ValueError, IndexError) as error:
-            raise ValueError(
-                f"sdf: failed for one point x of shape ({dim},), the dimension of the bounds; write it with "
-                "jax.numpy, jnp.where in place of if, for points of that dimension "
-                f"({type(error).__name__}: {str(error).splitlines()[0]})"
-            ) from error
-        if getattr(out, "shape", None) != () or not jnp.issubdtype(out.dtype, jnp.floating):
-            raise ValueError(
-                f"sdf: returned {out} for one point x of shape ({dim},), expected a real scalar; "
-                "it is mapped over points here, write it for a single one"
-            )
-        if out.dtype != jnp.float64:
-            raise ValueError(
-                f"sdf: computes in {out.dtype}, float64 was expected; drop casts and constants of lower precision"
-            )
 
     def _check_faces(self) -> None:
         """Raise where the domain reaches through the box."""
@@ -92,7 +68,7 @@ class SdfRegion:
         for i in range(0, count, _BATCH):
             part = x[i : i + _BATCH]
             padded = np.concatenate([part, np.broadcast_to(part[:1], (_BATCH - len(part), x.shape[1]))])
-            v, g = _value_and_gradient(self._sdf, padded)
+            v, g = self._recorded(padded)
             value[i : i + _BATCH], gradient[i : i + _BATCH] = (np.asarray(a)[: len(part)] for a in (v, g))
         beyond = np.maximum(self.lo - x, x - self.hi)
         out = beyond.max(axis=1)
@@ -146,6 +122,35 @@ class SdfRegion:
                 "cross zero with a slope (not be a square or an absolute value)"
             )
         return outward
+
+
+def _recorded(sdf: Any, dim: int) -> ClosedJaxpr:
+    """The function as it is now, of one point."""
+    if not callable(sdf):
+        raise ValueError(f"sdf: expected a function x (D,) -> scalar, got {sdf!r}")
+    if jax.dtypes.canonicalize_dtype(np.float64) != np.float64:
+        raise ValueError(
+            "sdf: JAX computes in float32 here, boundary particles to 1e-10 need float64; put "
+            'jax.config.update("jax_enable_x64", True) at the beginning of the program'
+        )
+    try:
+        closed, out = snapshot(sdf, jax.ShapeDtypeStruct((dim,), jnp.float64))
+    except IN_FUNCTIONS as error:
+        raise ValueError(
+            f"sdf: failed for one point x of shape ({dim},), the dimension of the bounds; write it with "
+            "jax.numpy, jnp.where in place of if, for points of that dimension "
+            f"({type(error).__name__}: {in_words(error).splitlines()[0]})"
+        ) from error
+    if getattr(out, "shape", None) != () or not jnp.issubdtype(out.dtype, jnp.floating):
+        raise ValueError(
+            f"sdf: returned {out} for one point x of shape ({dim},), expected a real scalar; "
+            "it is mapped over points here, write it for a single one"
+        )
+    if out.dtype != jnp.float64:
+        raise ValueError(
+            f"sdf: computes in {out.dtype}, float64 was expected; drop casts and constants of lower precision"
+        )
+    return closed
 
 
 def checked(region: SdfRegion, boundary: Boundary) -> Boundary:

@@ -12,6 +12,7 @@ import numpy as np
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.particle.kernels import EDGE
 from jsmitsm.runtime.arrays import Array, ArrayLike
+from jsmitsm.runtime.errors import short
 from jsmitsm.runtime.interrupts import interruptible
 from jsmitsm.runtime.progress import bar
 from jsmitsm.runtime.threads import cores
@@ -92,12 +93,12 @@ def stencils(cloud: Cloud, *, size: int | None = None, radius: ArrayLike | None 
             "build stencils = js.stencils(cloud, size=...) before the transform and pass them in"
         )
     if (size is None) == (radius is None):
-        raise ValueError(f"stencils: give either size or radius, got size={size!r} and radius={radius!r}")
+        raise ValueError(f"stencils: give either size or radius, got size={short(size)} and radius={short(radius)}")
     points = np.asarray(cloud.points)
     if size is None:
         return within(points, radius)
     if isinstance(size, bool) or not isinstance(size, (int, np.integer)) or size < 2:
-        raise ValueError(f"size: expected a whole number of at least 2 (the particle itself counts), got {size!r}")
+        raise ValueError(f"size: expected a whole number of at least 2 (the particle itself counts), got {short(size)}")
     return nearest(points, int(size))
 
 
@@ -257,8 +258,9 @@ def within(points: np.ndarray, radius: Any, which: np.ndarray | None = None) -> 
     centres = points if which is None else points[which]
     try:
         radius = np.asarray(radius, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise ValueError(f"radius: expected a positive scalar or ({len(centres)},) array, got {radius!r}") from None
+    except (TypeError, ValueError, OverflowError):
+        came = short(radius)
+        raise ValueError(f"radius: expected a positive scalar or ({len(centres)},) array, got {came}") from None
     if radius.shape not in ((), (len(centres),)) or not (np.isfinite(radius) & (radius > 0)).all():
         came = f"shape {radius.shape}" if radius.ndim else f"{radius}"
         raise ValueError(f"radius: expected positive numbers, a scalar or ({len(centres)},), got {came}")

@@ -26,7 +26,7 @@ def checked_loop(name: str, vertices: Any) -> np.ndarray:
     """Vertices (V, 2) of a polygon, counter-clockwise, not closed."""
     try:
         loop = np.asarray(vertices, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         loop = np.zeros(0)
     if loop.ndim != 2 or loop.shape[1] != 2:
         raise ValueError(f"{name}: expected an array of shape (V, 2), got {np.shape(loop)}")

@@ -11,6 +11,7 @@ from jsmitsm.cloud import contour, filling, levelset, polygons, surface
 from jsmitsm.cloud.cloud import INTERIOR, Cloud
 from jsmitsm.cloud.filling import Spacing, SpacingLike
 from jsmitsm.runtime.arrays import ArrayLike
+from jsmitsm.runtime.errors import short
 from jsmitsm.runtime.progress import bar
 
 # The cosine of 5 degrees: boundary particles whose normals differ by more may stand on two sides of a corner.
@@ -233,10 +234,10 @@ def _checked_bounds(bounds: Any) -> tuple[np.ndarray, np.ndarray]:
     try:
         lo, hi = (np.atleast_1d(np.asarray(corner, dtype=np.float64)) for corner in bounds)
         good = lo.shape == hi.shape and lo.ndim == 1 and len(lo) in (1, 2, 3)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         good = False
     if not good:
-        raise ValueError(f"bounds: expected (lo, hi) with D = 1, 2 or 3 numbers each, got {bounds!r}")
+        raise ValueError(f"bounds: expected (lo, hi) with D = 1, 2 or 3 numbers each, got {short(bounds)}")
     if not (np.isfinite(lo).all() and np.isfinite(hi).all() and (hi > lo).all()):
         raise ValueError(f"bounds: hi = {hi} must be greater than lo = {lo} along every axis, all finite")
     return lo, hi

@@ -21,6 +21,11 @@ from jsmitsm.taylor.series import Ring, mul
 
 # Coefficients and sources up to this have squares that are numbers.
 LARGEST = 1e150
+_SINGLE = (
+    "they must be finite and smooth there, and no larger than 3e38, where the numbers of float32 end, in which JAX "
+    'computes here: enable float64 with jax.config.update("jax_enable_x64", True), or measure lengths in units of the '
+    "size of the domain"
+)
 
 
 @dataclass
@@ -102,8 +107,9 @@ def _refuse_nonfinite(points: Any, *series: Any) -> None:
         bad = np.flatnonzero(~np.isfinite(np.asarray(values)).all(axis=tuple(range(np.ndim(values) - 1))))
         raise ValueError(
             f"pde: NaN or infinity at {len(bad)} particle(s), first at x = {np.asarray(points)[bad[0]]}, in the "
-            "coefficients, the source or their derivatives; they must be finite and smooth there: where a term is "
-            "divided by a coordinate (2 / r on an axis), multiply the equation by it"
+            "coefficients, the source or their derivatives; "
+            + (_SINGLE if np.asarray(values).dtype == np.float32 else "they must be finite and smooth there: where a "
+               "term is divided by a coordinate (2 / r on an axis), multiply the equation by it")
         )
 
 
@@ -114,7 +120,7 @@ def slot_series(rec: Recursion, slots: tuple[Slot, ...], taylor: Any, degree: in
 
 @partial(in_one_program, static=("rec", "slots", "degree"))
 def _derivatives(taylor: Any, rec: Recursion, slots: tuple[Slot, ...], degree: int) -> Any:
-    place = index_of(rec.dim, rec.order)
+    place = index_of(rec.dim, rec.reach)
     out = []
     for f, b in slots:
         up = [tuple(ti + bi for ti, bi in zip(t, b)) for t in multi_indices(rec.dim, degree)]

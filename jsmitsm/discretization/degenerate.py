@@ -17,6 +17,7 @@ import numpy as np
 from jsmitsm.discretization.layout import Discretization, mean_spacing, split
 from jsmitsm.equation.problem import Problem
 from jsmitsm.particle.recursion import Recursion, constraints, row_lifts
+from jsmitsm.particle.recursion import split as fit_and_tail
 from jsmitsm.runtime.tracers import any_number, concrete
 from jsmitsm.taylor.multi_indices import factorial, index_of
 
@@ -82,7 +83,8 @@ def settled(disc: Discretization, problem: Problem, nums: Any) -> Any:
     if seen and disc.scheme.method == "S" and np.shape(nums.jac)[-1] > 1:
         jac = concrete(nums.jac)
         jac = _in_general(disc, problem, nums.ids) if jac is None else np.asarray(jac)
-        at, least = candidates(disc, jac)
+        # What is not finite is told where the rows are made.
+        at, least = candidates(disc, jac) if np.isfinite(jac).all() else (np.zeros(0, int), np.zeros(0))
         if len(at):
             nums = _examined(disc, nums, jac, np.asarray(own), np.asarray(points), at, least)
     if not all(map(_same, old, (disc.lost, disc.dropped))):
@@ -163,14 +165,17 @@ def _particle(
 ) -> _Found:
     """The rank of one particle's rows, and which of its conditions add to it."""
     rec = disc.rec
+    # Of a recursion that goes deeper than the fit, the rows of the fit count.
+    low, _, first, _ = fit_and_tail(rec)
     matrix, lift = constraints(rec, jac, length, np)
-    equation = np.array([e for e, _ in rec.row_index])
-    size = np.where(np.any(matrix != 0, axis=1), row_lifts(rec, length, np) / lift, 0.0)
+    matrix, lift, lifts = matrix[np.ix_(first, low)], lift[first], row_lifts(rec, length, np)[first]
+    equation = np.array([e for e, _ in rec.row_index])[first]
+    size = np.where(np.any(matrix != 0, axis=1), lifts / lift, 0.0)
     largest = np.array([max(size[equation == e].max(), scale[e]) for e in range(len(rec.levels))])[equation]
     largest = np.where(largest > 0, largest, 1.0)
     full = size > EMPTY * largest
-    matrix, lift = np.where(full[:, None], matrix, 0.0), np.where(full, lift, row_lifts(rec, length, np) / largest)
-    right = np.zeros(len(lift)) if source is None else lift * source
+    matrix, lift = np.where(full[:, None], matrix, 0.0), np.where(full, lift, lifts / largest)
+    right = np.zeros(len(lift)) if source is None else lift * source[first]
     chosen, span, slack = _independent(matrix)
     conditions, scales = _functionals(disc, own, length)
     values = np.zeros(len(own)) if given is None else scales * given
@@ -214,13 +219,13 @@ def _independent(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
 
 def _functionals(disc: Discretization, own: np.ndarray, length: float) -> tuple[np.ndarray, np.ndarray]:
     """Conditions (n, S) as rows over the scaled coefficients, of unit length, and the factors of their values."""
-    rec, place = disc.rec, index_of(disc.rec.dim, disc.rec.order)
+    rec, place = disc.rec, index_of(disc.rec.dim, disc.rec.reach)
     rows = np.zeros((len(own), rec.fields * rec.size))
     for s, (f, b) in enumerate(disc.scheme.own):
         rows[:, f * rec.size + place[b]] += own[:, s] * factorial(b) * length ** -(sum(b) + rec.weights[f])
     norm = np.linalg.norm(rows, axis=1)
     norm = np.where(norm > 0, norm, 1.0)
-    return rows / norm[:, None], 1.0 / norm
+    return (rows / norm[:, None])[:, fit_and_tail(rec)[0]], 1.0 / norm
 
 
 def _first_kept(nums: Any, kept: dict[int, list[int]]) -> dict[str, Any]:

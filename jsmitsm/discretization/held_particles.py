@@ -33,7 +33,7 @@ def with_held_expansions(disc: Discretization, taylor: Any) -> Any:
         return taylor
     near = disc.stencils.indices[ids]
     given = ~disc.held.all(axis=1)
-    return _continued(taylor, disc.points, ids, near, disc.images.owners(near), given, disc.partner, disc.rec.order)
+    return _continued(taylor, disc.points, ids, near, disc.images.owners(near), given, disc.partner, disc.rec.reach)
 
 
 @partial(in_one_program, static=("order",))

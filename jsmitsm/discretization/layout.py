@@ -15,7 +15,7 @@ from jsmitsm.cloud.walls import Walls, seen
 from jsmitsm.discretization.periodic import Images, periodic_images, with_corners
 from jsmitsm.discretization.supports import check_supports, cut_off, default_kernel, find_stencils, walls_of
 from jsmitsm.equation.branches import FIELD
-from jsmitsm.equation.closing import closed, in_words
+from jsmitsm.equation.closing import closed
 from jsmitsm.equation.conditions import Group, group_conditions
 from jsmitsm.equation.problem import Problem
 from jsmitsm.equation.tracing import Traced, trace
@@ -23,6 +23,7 @@ from jsmitsm.particle.elimination import Scheme
 from jsmitsm.particle.kernels import Constant, Kernel
 from jsmitsm.particle.recursion import Recursion, free_indices, recursion
 from jsmitsm.runtime.compiled import at_hand
+from jsmitsm.runtime.errors import IN_FUNCTIONS, in_words
 from jsmitsm.runtime.tracers import concrete, is_traced, owned
 
 
@@ -81,7 +82,7 @@ class Discretization:
         """Fields that the problem determines only up to a constant: no value of theirs enters."""
         zero = (0,) * self.rec.dim
         values = {f for f, b in (*self.rec.slots, *self.scheme.own) if b == zero}
-        return tuple(f for f in range(self.rec.fields) if f not in values) if self.linear else ()
+        return tuple(f for f in range(self.rec.fields) if f not in values)
 
     @property
     def active(self) -> np.ndarray:
@@ -99,17 +100,23 @@ class Discretization:
 
 def discretize(
     problem: Problem, cloud: Cloud, method: str, order: int, kernel: Kernel | None,
-    stencils: Stencils | None, basis_terms: int | None, sources: bool = True,
+    stencils: Stencils | None, basis_terms: int | None, sources: bool = True, depth: int | str = 0,
 ) -> Discretization:  # fmt: skip
     """Trace the problem, lay out its recursion and conditions, and find neighbours.
 
     sources: whether the weights of the source are wanted even where it is zero.
     """
+    kernel = kernel and kernel.recorded()
     traced = _traced(problem, cloud.dim)
     _check_operator(traced, problem, order)
     problem = closed(problem, traced)
     kernel, stencils = jax.tree.map(owned, (kernel, stencils))
+    sourced = sources or not traced.linear or traced.source != "zero"
     rec = recursion(cloud.dim, order, problem.fields, traced.slots, traced.pattern, traced.order)
+    flat = traced.constant and rec.scale_free
+    if depth == "auto":
+        depth = suited_depth(method, rec, flat, sourced)
+    rec = recursion(cloud.dim, order, problem.fields, traced.slots, traced.pattern, traced.order, int(depth))
     groups = group_conditions(problem, with_corners(problem, cloud), order, traced.order)
     held = np.zeros((len(cloud), problem.fields), bool)
     for group in groups:
@@ -121,8 +128,7 @@ def discretize(
     for group in groups:
         n_own[group.ids] = group.n_rows + len(group.held)
     scheme = _scheme(method, rec, traced, problem, cloud, basis_terms)
-    sourced = sources or not traced.linear or traced.source != "zero"
-    scheme = replace(scheme, **_conditions_layout(groups, rec), sourced=sourced)
+    scheme = replace(scheme, **_conditions_layout(groups, rec), sourced=sourced, flat=flat)
     if len(images.owner) and method in ("I", "II"):
         raise ValueError(f"method: {method} does not follow periodic conditions; use S, III or SSPH")
     if scheme.n_data and method in ("I", "II", "III"):
@@ -162,6 +168,19 @@ def discretize(
     if traced.branches is not None and not traced.branches.depends & FIELD:
         refuse_jumps(disc, problem)
     return disc
+
+
+def suited_depth(method: str, rec: Recursion, flat: bool, sourced: bool) -> int:
+    """How many degrees the recursion should go beyond the fit.
+
+    Measured: two degrees have all of the gain where the solution is mild, four gain 2 to 10 times more where it
+    oscillates. I, II and III are the paper's. Where neither the operator nor a source has anything to say there, none.
+    """
+    if method != "S" or rec.order < 2 or (flat and not sourced):
+        return 0
+    if rec.order == 2 or (rec.dim == 3 and not flat):
+        return 2
+    return 4
 
 
 def mean_spacing(disc: Discretization) -> float:
@@ -296,7 +315,7 @@ def _traced(problem: Problem, dim: int) -> Traced:
         pass
     try:
         return trace(problem.pde, dim, problem.fields, params=problem.params)
-    except (TypeError, ValueError, IndexError) as error:
+    except IN_FUNCTIONS as error:
         text = in_words(error)
         raise ValueError(text if text.startswith("pde") else f"pde: {text}; it returns a number or a scalar per "
                          "equation") from error  # fmt: skip

@@ -79,7 +79,7 @@ def _eliminations(disc: Discretization, nums: Numbers, cls: Class) -> tuple[Elim
         return None
     if isinstance(nums.jac, jax.Array):
         return None
-    own = default_kernel(points, cls.ids, near) if kernel is None else kernel.at(cls.ids)
+    own = default_kernel(points, cls.ids, near, cls.scheme.decay) if kernel is None else kernel.at(cls.ids)
     length = np.broadcast_to(np.asarray(own.length), cls.ids.shape)
     if not (length > 0).all():
         return None

@@ -18,7 +18,7 @@ def prefers_least_squares(disc: Discretization, nums: Numbers) -> bool:
     """
     rec, jac = disc.rec, concrete(nums.jac)
     jac = None if jac is None else np.asarray(jac)  # where it only carries derivatives, no operation is recorded
-    orders = {rec.order - q for q in rec.degrees}
+    orders = set(rec.orders)
     if disc.scheme.method != "S" or rec.fields > 1:
         return False
     if orders == {1}:
@@ -59,7 +59,7 @@ def cell_peclet(disc: Discretization, nums: Numbers) -> float:
     rec = disc.rec
     drift = [s for s, (_, b) in enumerate(rec.slots) if sum(b) == 1]
     second = [s for s, (_, b) in enumerate(rec.slots) if sum(b) == 2]
-    orders = {rec.order - q for q in rec.degrees}
+    orders = set(rec.orders)
     if rec.fields > 1 or orders != {2} or not drift or not second or is_traced(nums.jac, disc.cloud.points):
         return 0.0
     jac = np.asarray(nums.jac)[0, :, 0]
@@ -72,7 +72,7 @@ def wave_number(disc: Discretization, nums: Numbers) -> float:
     rec = disc.rec
     zero = [s for s, (_, b) in enumerate(rec.slots) if sum(b) == 0]
     pure = [s for s, (_, b) in enumerate(rec.slots) if sum(b) == 2 and max(b) == 2]
-    orders = {rec.order - q for q in rec.degrees}
+    orders = set(rec.orders)
     if rec.fields > 1 or orders != {2} or not zero or not pure or is_traced(nums.jac, disc.cloud.points):
         return 0.0
     jac = np.asarray(nums.jac)[0, :, 0]

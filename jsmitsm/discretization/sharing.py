@@ -75,7 +75,8 @@ def _worth(nums: Numbers, classes: list[Class]) -> int:
 
 def work(nums: Numbers, cls: Class) -> int:
     """How much the system of one particle is to make, in numbers."""
-    columns = cls.scheme.rec.size * cls.scheme.rec.fields
+    rec = cls.scheme.rec
+    columns = rec.size * rec.fields
     matrix = cls.neighbours.shape[1] * columns * _TIMES.get(cls.scheme.method, 1)
     return matrix + (columns**3 // 4 if nums.jac.shape[-1] > 1 else 0)
 

@@ -14,6 +14,7 @@ from jsmitsm.discretization.periodic import Images
 from jsmitsm.equation.problem import Problem
 from jsmitsm.particle.elimination import Scheme
 from jsmitsm.particle.kernels import EDGE, Kernel, fitted
+from jsmitsm.particle.recursion import split
 from jsmitsm.runtime.tracers import concrete, is_traced
 
 # Neighbours for every free coefficient, by the order of the expansions, where the particles are evenly spaced.
@@ -29,7 +30,8 @@ def scheme_size(scheme: Scheme) -> int:
         return rec.size
     if scheme.free:
         return len(scheme.free)
-    return -(-(rec.fields * rec.size - rec.n_rows) // rec.fields)
+    columns, _, rows, _ = split(rec)
+    return -(-(len(columns) - len(rows)) // rec.fields)
 
 
 def default_size(scheme: Scheme, even: bool = False) -> int:
@@ -118,12 +120,12 @@ def _found_stencils(
     return within_seen(points, np.asarray(kernel.d) * np.asarray(kernel.h), which, walls)
 
 
-def default_kernel(points: Any, ids: np.ndarray, near: Any) -> Kernel:
+def default_kernel(points: Any, ids: np.ndarray, near: Any, decay: float = 2.0) -> Kernel:
     """The kernel of the particles ``ids`` (n,) without one of the user's: it fits their neighbours ``near`` (n, w)."""
     xp = jnp if is_traced(near, points) else np
     near, points = xp.asarray(near), xp.asarray(points)
     offset = points[xp.where(near >= 0, near, ids[:, None])] - points[ids][:, None]
-    return fitted(xp.sqrt(xp.max(xp.sum(offset**2, axis=2), axis=1)))
+    return fitted(xp.sqrt(xp.max(xp.sum(offset**2, axis=2), axis=1)), decay)
 
 
 def check_supports(

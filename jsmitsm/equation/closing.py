@@ -11,6 +11,7 @@ import jax.numpy as jnp
 
 from jsmitsm.equation.problem import Condition, Problem
 from jsmitsm.equation.tracing import Traced, trace
+from jsmitsm.runtime.errors import IN_FUNCTIONS, in_words
 from jsmitsm.runtime.tracers import owned
 
 
@@ -62,22 +63,10 @@ def _named(where: str, expected: str) -> Iterator[None]:
     """Say which of the user's functions failed, and what was expected of it."""
     try:
         yield
-    except (TypeError, ValueError, IndexError) as error:
+    except IN_FUNCTIONS as error:
         if str(error).startswith(where):
             raise
         raise ValueError(f"{where}: expected {expected}; calling it failed: {in_words(error)}") from error
-
-
-def in_words(error: Exception) -> str:
-    """What went wrong in a user's function, with the remedy where Python's own message has none."""
-    text = str(error)
-    if isinstance(error, jax.errors.ConcretizationTypeError | jax.errors.TracerArrayConversionError):
-        return (f"{text.splitlines()[0]} It must be written in jax.numpy: jnp.sin for np.sin or math.sin, "
-                "jnp.where for an if")  # fmt: skip
-    if isinstance(error, IndexError):
-        return (f"{text}; x is one point of shape (D,), x[0] its first coordinate; u(x) is a number, and a vector (F,) "
-                "with js.Problem(..., fields=F)")  # fmt: skip
-    return text
 
 
 def _shaped(result: Any, components: int, where: str) -> Any:

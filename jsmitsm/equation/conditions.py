@@ -15,6 +15,7 @@ from jsmitsm.cloud.cloud import INTERIOR, Cloud
 from jsmitsm.equation.closing import recorded_residual, recorded_values
 from jsmitsm.equation.problem import Condition, Problem
 from jsmitsm.equation.tracing import Traced
+from jsmitsm.runtime.errors import did_you_mean
 from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.runtime.whole_program import in_one_program, picked
 from jsmitsm.taylor.multi_indices import Slot
@@ -68,7 +69,8 @@ def group_conditions(problem: Problem, cloud: Cloud, order: int, orders: tuple[i
     used = {name for cs in given.values() for c in cs if c.kind == "periodic" for name in c.groups}
     unknown = sorted(used - set(names))
     if unknown:
-        raise ValueError(f"bcs: periodic names {unknown[0]!r}, which is no boundary group of the cloud; it has {names}")
+        raise ValueError(f"bcs: periodic names {unknown[0]!r}, which is no boundary group of the cloud; it has {names}"
+                         + did_you_mean(unknown[0], names))  # fmt: skip
     missing = [n for n in names if n not in given and n not in used and len(cloud.groups[n])]
     if missing:
         stray = [n for n in given if n not in cloud.groups]
@@ -76,6 +78,7 @@ def group_conditions(problem: Problem, cloud: Cloud, order: int, orders: tuple[i
             f"bcs: no condition for the boundary group(s) {missing}; the cloud has {names}"
             + (f", but not {stray}. " if stray else ". ") +
             "Give each a condition, js.free() where none belongs"
+            + next(filter(None, (did_you_mean(n, missing) for n in stray)), "")
         )
     seconds = {c.groups[1] for cs in given.values() for c in cs if c.kind == "periodic"}
     for name in seconds & set(given):
@@ -90,7 +93,7 @@ def group_conditions(problem: Problem, cloud: Cloud, order: int, orders: tuple[i
     for name, conditions in given.items():
         pinned = [c for c in conditions if c.kind == "fix"]
         if name not in cloud.groups and len(pinned) < len([c for c in conditions if c.kind != "periodic"]):
-            raise ValueError(f"bcs: {name!r} is no group of the cloud; it has {names}")
+            raise ValueError(f"bcs: {name!r} is no group of the cloud; it has {names}{did_you_mean(name, names)}")
         if name == INTERIOR and len(pinned) < len(conditions):
             raise ValueError('bcs: "interior" takes no boundary condition; hold single particles with js.fix')
         groups += [_laid_out(problem, cloud, name, np.array(c.indices), [c], order, highest) for c in pinned]

@@ -9,11 +9,12 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
+from jax.extend.core import Literal
 
 from jsmitsm.equation.field import Field, LocalField, field_p, frozen_p
 from jsmitsm.equation.marks import DIFFERENTIATED
-from jsmitsm.runtime.jaxprs import EVERYTHING, bind, called, levels, literal
+from jsmitsm.runtime.jaxprs import EVERYTHING, bind, called, inner_jaxprs, levels, literal
+from jsmitsm.runtime.snapshot import snapshot
 from jsmitsm.runtime.tracers import owned
 from jsmitsm.taylor.elementwise import ELEMENTWISE
 from jsmitsm.taylor.multi_indices import Slot
@@ -30,24 +31,6 @@ _LINEAR = frozenset(
     "neg sub add add_any reshape broadcast_in_dim squeeze expand_dims transpose slice rev reduce_sum concatenate stack "
     "tile pad convert_element_type copy copy_p cumsum".split()
 )
-
-
-def inner_jaxprs(eqn: Any) -> list[Jaxpr]:
-    """Every jaxpr among the parameters of an operation."""
-    found: list[Jaxpr] = []
-
-    def look(value: Any) -> None:
-        if isinstance(value, ClosedJaxpr):
-            found.append(value.jaxpr)
-        elif isinstance(value, Jaxpr):
-            found.append(value)
-        elif isinstance(value, tuple | list):
-            for v in value:
-                look(v)
-
-    for value in eqn.params.values():
-        look(value)
-    return found
 
 
 def slots_of(jaxpr: Any) -> set[Slot]:
@@ -325,8 +308,8 @@ def record(
     dtype = jnp.result_type(float)
     point = jax.ShapeDtypeStruct((field.dim,), dtype)
     others = [jax.ShapeDtypeStruct(tuple(shape), dtype) for shape in extras]
-    first = jax.make_jaxpr(lambda x, e, p: _values(residual(field, x, *e, *(() if params is None else (p,))), dtype))(
-        point, others, params
+    first, _ = snapshot(
+        lambda x, e, p: _values(residual(field, x, *e, *(() if params is None else (p,))), dtype), point, others, params
     )
     flat: Any = first.jaxpr
     check_points(flat, [POINT] + [FREE] * (len(flat.invars) - 1))

@@ -10,7 +10,8 @@ import numpy as np
 
 from jsmitsm.equation.tracing import Traced
 from jsmitsm.runtime.arrays import ArrayLike, ValueOrFunction
-from jsmitsm.runtime.errors import refuse_masked
+from jsmitsm.runtime.errors import did_you_mean, refuse_masked, short
+from jsmitsm.runtime.tracers import is_traced
 
 
 @jax.tree_util.register_pytree_node_class
@@ -141,9 +142,9 @@ def fix(indices: ArrayLike, value: ValueOrFunction, field: int | None = None) ->
     fix(indices=(12,), value=0.0)
     """
     refuse_masked(indices, "indices")
-    index = np.atleast_1d(np.asarray(indices))
+    index = np.atleast_1d(np.array(None) if is_traced(indices) else np.asarray(indices))
     if index.ndim != 1 or index.dtype.kind not in "iu" or not index.size:
-        raise ValueError(f"indices: expected particle numbers, got {indices!r}")
+        raise ValueError(f"indices: expected particle numbers, got {short(indices)}")
     if index.min() < 0 or len(np.unique(index)) != len(index):
         raise ValueError(f"indices: particles are numbered from 0 and given once each, got {index.tolist()}")
     return Condition("fix", _field(field), indices=tuple(int(i) for i in index), value=_value(value, "value"))
@@ -161,7 +162,7 @@ def free() -> Condition:
 
 def _field(field: Any) -> int | None:
     if field is not None and (isinstance(field, bool) or not isinstance(field, (int, np.integer)) or field < 0):
-        raise ValueError(f"field: expected the number of a field (0, 1, ...), got {field!r}")
+        raise ValueError(f"field: expected the number of a field (0, 1, ...), got {short(field)}")
     return None if field is None else int(field)
 
 
@@ -174,9 +175,9 @@ def _value(value: Any, name: str) -> Any:
         array = np.asarray(value)
         if array.dtype.kind not in "fiu":
             raise TypeError
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise ValueError(
-            f"{name}: expected a number, an array over the group or a function of x, got {value!r}"
+            f"{name}: expected a number, an array over the group or a function of x, got {short(value)}"
         ) from None
     if not np.isfinite(array).all():
         raise ValueError(f"{name}: NaN or infinite numbers; give finite boundary data")
@@ -222,7 +223,7 @@ class Problem:
         if not callable(pde):
             raise ValueError(f"pde: expected a function pde(u, x) returning the residual, got {type(pde).__name__}")
         if isinstance(fields, bool) or not isinstance(fields, (int, np.integer)) or fields < 1:
-            raise ValueError(f"fields: expected the number of unknown fields (1, 2, ...), got {fields!r}")
+            raise ValueError(f"fields: expected the number of unknown fields (1, 2, ...), got {short(fields)}")
         if not isinstance(bcs, Mapping):
             raise ValueError(
                 f"bcs: expected a dict from group name to condition, got {type(bcs).__name__}; "
@@ -238,7 +239,8 @@ class Problem:
         """The same problem with other ``changes``: ``params``, ``pde``, ``bcs`` or ``fields``; ValueError for more."""
         unknown = sorted(set(changes) - {"pde", "bcs", "fields", "params"})
         if unknown:
-            raise ValueError(f"{unknown[0]}: no part of a Problem; it has pde, bcs, fields and params")
+            raise ValueError(f"{unknown[0]}: no part of a Problem; it has pde, bcs, fields and params"
+                             + did_you_mean(unknown[0], ("pde", "bcs", "fields", "params")))  # fmt: skip
         parts = {"pde": self.pde, "bcs": self.bcs, "fields": self.fields, "params": self.params}
         return Problem(**{**parts, **changes})
 
@@ -269,7 +271,7 @@ def _check_params(params: Any) -> None:
         where = f"params{jax.tree_util.keystr(path)}"
         if getattr(leaf, "dtype", np.asarray(leaf).dtype if np.isscalar(leaf) else np.dtype(object)).kind not in "biuf":
             raise ValueError(
-                f"{where}: expected a real number or array, got {leaf!r}; let the pde close over it instead"
+                f"{where}: expected a real number or array, got {short(leaf)}; let the pde close over it instead"
             )
         if not np.isfinite(np.asarray(leaf)).all():
             raise ValueError(f"{where}: NaN or infinite numbers; give finite ones")
@@ -282,8 +284,9 @@ def _listed(name: Any, value: Any, fields: int) -> list[Condition]:
     given = list(value) if isinstance(value, (list, tuple)) else [value]
     for c in given:
         if not isinstance(c, Condition):
+            came = short(c)
             raise ValueError(
-                f"bcs[{name!r}]: expected a condition, got {c!r}; write js.dirichlet({c!r}), js.neumann(...) or such"
+                f"bcs[{name!r}]: expected a condition, got {came}; write js.dirichlet({came}), js.neumann(...) or such"
             )
         if c.field is not None and c.field >= fields:
             raise ValueError(f"bcs[{name!r}]: field={c.field}, but the problem has fields 0 to {fields - 1}")

@@ -1,13 +1,16 @@
-"""When may a recorded function be used again? When nothing that it can see has changed.
+"""When may a recorded function be used again? When all that it can reach is known to be the same.
 
 JAX remembers functions by identity, so that a lambda written anew is recorded anew, and one that
 reads a changed global is not. Here a function is remembered by its code and by the values that the
-code refers to; where those cannot be compared (an object of unknown kind, a traced value) it is
-not remembered at all.
+code can reach. Numbers, arrays, containers and functions made of such are followed; what JAX, NumPy
+and Python bring along is taken as it is where it is proven to have no state (:mod:`jsmitsm.equation.stateless`).
+Everything else (an object with attributes, a generator, a file, what is looked up by a name made at run
+time) is :class:`Unknown`, and such a function is recorded at every use: that takes milliseconds.
 """
 
 from __future__ import annotations
 
+import builtins
 import functools
 import threading
 import types
@@ -18,15 +21,22 @@ from typing import Any
 import jax
 import numpy as np
 
+from jsmitsm.equation.lookups import Lookups, lookups
+from jsmitsm.equation.stateless import attribute, made_by_library, of_library, stateless
+
 # Recorded functions kept, and the largest array compared by its contents.
 _KEPT = 256
 _LARGEST = 100_000
-# Their functions do not change between calls, whatever globals they read.
-_TRUSTED = ("jax", "jaxlib", "jsmitsm", "numpy", "builtins", "math")
+_ATOMS = frozenset({type(None), type(Ellipsis), bool, int, str, bytes})
+# Settings of JAX that change what is recorded.
+_SETTINGS = (
+    "jax_enable_x64", "jax_numpy_dtype_promotion", "jax_numpy_rank_promotion", "jax_default_matmul_precision",
+    "jax_disable_jit", "jax_debug_nans",
+)  # fmt: skip
 
 
 class Unknown(Exception):
-    """Something that cannot be compared."""
+    """Something that cannot be known to be unchanged."""
 
 
 class _Same:
@@ -47,79 +57,117 @@ def identity(function: Callable[..., Any]) -> Any:
     return _value(function, {})
 
 
-def _trusted(name: Any) -> bool:
-    return isinstance(name, str) and name.partition(".")[0] in _TRUSTED
-
-
 def _value(value: Any, seen: dict[int, int]) -> Any:
-    """What stands for one value in the comparison; ``seen`` numbers functions, which may be recursive."""
+    """What stands for one value in the comparison; ``seen`` numbers what may hold itself."""
     kind = type(value)
-    if value is None or kind in (bool, int, str, bytes, complex):
+    if kind in _ATOMS:
         return kind, value
     if kind is float:
         return kind, value.hex()  # 0.0 and -0.0 differ
-    if isinstance(value, (np.ndarray, np.generic)):
-        if value.size > _LARGEST or value.dtype.hasobject:
-            raise Unknown
-        return kind, value.shape, value.dtype.str, value.tobytes()
-    if isinstance(value, jax.core.Tracer):
-        raise Unknown
-    if isinstance(value, (jax.Array, types.ModuleType, types.BuiltinFunctionType, np.ufunc)):
+    if kind is complex:
+        return kind, value.real.hex(), value.imag.hex()
+    if kind is range:
+        return kind, value.start, value.stop, value.step
+    if isinstance(value, jax.Array | np.ndarray | np.generic):
+        return _array(value)
+    if stateless(value):
         return _Same(value)
-    if kind in (tuple, list):
+    if id(value) in seen:
+        return "again", seen[id(value)]
+    seen[id(value)] = len(seen)
+    if kind in (tuple, list, set, frozenset):
         return kind, tuple(_value(v, seen) for v in value)
     if kind is dict:
         return kind, tuple((_value(k, seen), _value(v, seen)) for k, v in value.items())
-    if isinstance(value, functools.partial):
-        return kind, *(_value(v, seen) for v in (value.func, value.args, value.keywords))
-    if isinstance(value, types.FunctionType):
+    if kind is functools.partial:
+        return kind, *(_value(v, seen) for v in (value.func, value.args, value.keywords, vars(value)))
+    if kind is types.FunctionType:
         return _function(value, seen)
-    if callable(value) and not isinstance(value, type) and _trusted(kind.__module__) and _trusted(
-        getattr(value, "__module__", None)
-    ):  # fmt: skip
-        return _Same(value)  # jax.numpy's compiled functions
     raise Unknown
 
 
+def _array(value: Any) -> Any:
+    """By its contents: numpy's arrays can be changed in place, and those of JAX may share their memory."""
+    kind = type(value)
+    if isinstance(value, jax.core.Tracer) or value.size > _LARGEST:
+        raise Unknown
+    if isinstance(value, jax.Array):
+        if jax.dtypes.issubdtype(value.dtype, jax.dtypes.extended) or not value.is_fully_addressable:
+            raise Unknown
+        return kind, value.shape, str(value.dtype), value.weak_type, np.asarray(value).tobytes()
+    # Subclasses have attributes, structures names; of an array without axes a record would keep the array itself.
+    plain = kind is np.ndarray and value.ndim or isinstance(value, np.generic) and kind.__module__ == "numpy"
+    if not plain or value.dtype.kind not in "biufc":
+        raise Unknown
+    return kind, value.shape, value.strides, value.dtype.str, value.tobytes()
+
+
 def _function(function: types.FunctionType, seen: dict[int, int]) -> Any:
-    """Code, defaults, closure, and the globals that the code names."""
-    if id(function) in seen:
-        return "again", seen[id(function)]
-    seen[id(function)] = len(seen)
+    """Code, defaults, attributes, and what the code looks up in its closure and in its globals."""
+    code = function.__code__
+    defaults = function.__defaults__, function.__kwdefaults__, function.__dict__
     try:
-        cells = tuple(cell.cell_contents for cell in function.__closure__ or ())
+        cells = {name: cell.cell_contents for name, cell in zip(code.co_freevars, function.__closure__ or ())}
     except ValueError:  # a cell that is still empty
         raise Unknown from None
-    visible: list[Any] = [cells, function.__defaults__, function.__kwdefaults__]
-    if not _trusted(function.__globals__.get("__name__")):
-        names = sorted(_names(function.__code__))
-        visible.append({n: function.__globals__[n] for n in names if n in function.__globals__})
-    return function.__code__, _value(visible, seen)
+    if made_by_library(function):
+        return code, tuple(_Same(v) if of_library(v) else _value(v, seen) for v in (*cells.values(), *defaults))
+    looks = lookups(code)
+    if looks is None or function.__builtins__ is not vars(builtins):  # type: ignore[attr-defined]
+        raise Unknown
+    found = [_value(v, seen) for v in defaults]
+    found += [_looked_up(value, looks.closure.get(name, frozenset()), seen) for name, value in cells.items()]
+    return code, tuple(found), tuple(_global(function, name, looks, seen) for name in looks.names)
 
 
-def _names(code: types.CodeType) -> set[str]:
-    """All names that a code and the functions inside of it may look up."""
-    inner = (c for c in code.co_consts if isinstance(c, types.CodeType))
-    return set(code.co_names).union(*map(_names, inner))
+def _global(function: types.FunctionType, name: str, looks: Lookups, seen: dict[int, int]) -> Any:
+    for scope in (function.__globals__, vars(builtins)):
+        if name in scope:
+            return _looked_up(scope[name], looks.globals[name], seen)
+    return "missing", name
+
+
+def _looked_up(value: Any, chains: frozenset[tuple[str, ...]], seen: dict[int, int]) -> Any:
+    """A value by itself; a module by those of its attributes that are read, and by nothing else."""
+    if type(value) is not types.ModuleType:
+        return _value(value, seen)
+    if () in chains:  # it is handed on, and may be asked for anything
+        raise Unknown
+    found = []
+    for name in sorted({chain[0] for chain in chains}):
+        further = frozenset(chain[1:] for chain in chains if chain[0] == name)
+        try:
+            found.append((name, _looked_up(attribute(value, name), further, seen)))
+        except AttributeError:
+            raise Unknown from None
+    return tuple(found)
 
 
 _records: OrderedDict[Any, Any] = OrderedDict()
 _lock = threading.Lock()  # solves may run in several threads
 
 
-def recalled(function: Callable[..., Any], rest: Any, make: Callable[[], Any], keep: Callable[[Any], bool]) -> Any:
-    """``make()``, or what it returned when the function was last seen with the same hashable ``rest``."""
+def _key(function: Callable[..., Any], rest: Any) -> Any:
+    """What a record is kept under, or None where it is not kept."""
     try:
-        key = identity(function), rest, jax.config.read("jax_enable_x64")
+        key = identity(function), rest, tuple(getattr(jax.config, name) for name in _SETTINGS)
         hash(key)
     except (Unknown, TypeError, RecursionError):
-        return make()
-    with _lock:
-        if key in _records:
-            _records.move_to_end(key)
-            return _records[key]
+        return None
+    return key
+
+
+def recalled(function: Callable[..., Any], rest: Any, make: Callable[[], Any], keep: Callable[[Any], bool]) -> Any:
+    """``make()``, or what it returned when the function was last seen with the same hashable ``rest``."""
+    key = _key(function, rest)
+    if key is not None:
+        with _lock:
+            if key in _records:
+                _records.move_to_end(key)
+                return _records[key]
     made = make()
-    if keep(made):
+    # A function that changes what it sees does something else the next time.
+    if key is not None and keep(made) and _key(function, rest) == key:
         with _lock:
             _records[key] = made
             if len(_records) > _KEPT:

@@ -318,10 +318,10 @@ def trace(
     has of its own and that do not vary with x (its normal, a boundary value); ``params``, any
     pytree, passed last unless None.
 
-    The function is called once, and not again as long as all that it can see stays the same.  What
-    it closes over may be traced by JAX.  The classification is
-    read off the recorded operations, element by element; where in doubt a coefficient counts as
-    dependent, which costs time but never correctness.
+    The function is called when it is first seen, and again where anything that it can see may have
+    changed.  What it closes over may be traced by JAX.  The classification is read off the recorded
+    operations, element by element; where in doubt a coefficient counts as dependent, which costs time
+    but never correctness.
 
     Raises ``ValueError`` if the field is evaluated anywhere but at x, or if the result is not a
     scalar or a vector.
@@ -332,12 +332,24 @@ def trace(
     (((0, (2, 0)), (0, (0, 2))), (2,), True, True, 'variable')
     """
     leaves, tree = jax.tree.flatten(params)
-    rest = dim, fields, tuple(extras), tree, tuple((np.shape(v), jnp.result_type(v)) for v in leaves)
+    rest = dim, fields, tuple(extras), tree, tuple((v.shape, v.dtype, v.weak_type) for v in map(jax.typeof, leaves))
 
     def make() -> Traced:
         return _classified(record(residual, local_field(dim, fields), extras, params), dim, fields, len(extras), tree)
 
+    if not _is_plain(tree):
+        return make()
     return recalled(residual, rest, make, lambda made: not _holds_tracers(made))
+
+
+def _is_plain(tree: Any) -> bool:
+    """Whether parameters stand in Python's containers: those of other kinds may hold more than the numbers."""
+    node = tree.node_data()
+    if node is None:
+        return True
+    kind, keys = node
+    named = kind is dict and all(type(k) in (str, int) for k in keys)
+    return (named or kind in (list, tuple, type(None))) and all(map(_is_plain, tree.children()))
 
 
 def _holds_tracers(traced: Traced) -> bool:

@@ -227,7 +227,7 @@ def _without_empty(tree: Any) -> Any:
 
 def _prepared(scheme, points, kernel, i, near_ids, operands: Operands, jac, own):
     """The support, elimination and conditions of one particle."""
-    near = moments.support(points, i, near_ids, kernel)
+    near = moments.support(points, i, near_ids, kernel, scheme.decay)
     if operands.shared is None:
         solution = eliminate(scheme, jac, near.length)
     elif operands.lengths is not None:

@@ -102,10 +102,10 @@ def tests_i_ii(scheme: Scheme, near: Support) -> Any:
 
 def derivative_rows(scheme: Scheme, near: Support) -> Any:
     """The neighbours' derivatives d^b u, b free, as functionals of U_i: (ns, free, K)."""
-    p = monomials(near.offset, scheme.rec.order)
+    p = monomials(near.offset, scheme.rec.reach)
     rows = []
     for b in free_multi_indices(scheme):
-        lower, factor = derivative_table(scheme.rec.dim, scheme.rec.order, b)
+        lower, factor = derivative_table(scheme.rec.dim, scheme.rec.reach, b)
         rows.append(p[:, lower] * factor)
     return jnp.stack(rows, axis=1)
 

@@ -1,4 +1,15 @@
-"""The recursion of one particle solved for its free coefficients: U = Q F + B c."""
+"""The recursion of one particle solved for its free coefficients: U = Q F + B c.
+
+The fit knows the coefficients up to the order. The recursion goes on beyond it: with the constraints parted into
+those that reach no further than the fit and the deeper ones,
+
+    M_ll u_l = F_l,      M_hl u_l + M_hh u_h = F_h,
+
+the tail u_h follows from u_l. It has more coefficients than equations; of all solutions the one of least Fischer
+norm sum a! u_a^2 is taken, u_h = E (F_h - M_hl u_l) with E = D (M_hh D)^+ and D = diag(1 / sqrt(a!)). That norm does
+not depend on the axes, and it keeps tails small where convection is strong, where degree by degree or axis by axis
+they grow without bound.
+"""
 
 from __future__ import annotations
 
@@ -10,9 +21,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm.particle.polynomials import whitening
-from jsmitsm.particle.recursion import Recursion, constraints, row_lifts, substitution
-from jsmitsm.particle.small_systems import independent, null_space
-from jsmitsm.taylor.multi_indices import Slot
+from jsmitsm.particle.recursion import Recursion, constraints, row_lifts, split, substitution
+from jsmitsm.particle.small_systems import independent, min_norm, null_space
+from jsmitsm.taylor.multi_indices import Slot, factorial, multi_indices
+
+# The ridge of a deep equation, as a part of its square.
+RIDGE = 1e-6
+# The deep part of an equation below this part of the whole says nothing of the tail.
+FAINT = 1e-6
 
 # A row of the recursion below this part of its equation's largest holds nothing but rounding.
 SMALL = 1e-12
@@ -28,6 +44,8 @@ class Scheme:
     own : slots of the particle's own boundary conditions, and their number.
     data : slots of the conditions that neighbours contribute as data, and their number.
     sourced : whether the source's weights are wanted.
+    flat : whether the homogeneous local solutions end with the fit: those of a constant operator whose terms are all
+        of one order are sums of homogeneous polynomials.
     lost : rows of the recursion that add nothing to the others, where the equation degenerates.
     """
 
@@ -41,6 +59,13 @@ class Scheme:
     n_data: int = 0
     sourced: bool = True
     lost: int = 0
+    flat: bool = False
+
+    @property
+    def decay(self) -> float:
+        """Without a kernel the weight is exp(-(decay r / r_max)^2). Deeper polynomials are true farther out, and
+        measured best when the fit is drawn to the near ones."""
+        return 2.5 if self.rec.depth and self.rec.order >= 3 else 2.0
 
 
 class Elimination(NamedTuple):
@@ -52,9 +77,22 @@ class Elimination(NamedTuple):
     rows: Any  # (F, F K): the equations themselves, needed by collocation
 
 
-def _blocks(matrix: Any, fields: int) -> Any:
-    """The whitening applied to each field's block of columns."""
-    return matrix if fields == 1 else jnp.kron(jnp.eye(fields), matrix)
+@lru_cache(maxsize=64)
+def _whitening(rec: Recursion) -> np.ndarray:
+    """The whitening applied to each field's block of the fit's columns."""
+    blocks = [whitening(rec.dim, rec.order - (w if rec.depth else 0)) for w in rec.weights]
+    out = np.zeros((sum(map(len, blocks)),) * 2)
+    start = 0
+    for block in blocks:
+        out[start : start + len(block), start : start + len(block)] = block
+        start += len(block)
+    return out
+
+
+@lru_cache(maxsize=64)
+def _fischer(rec: Recursion) -> np.ndarray:
+    """1 / sqrt(a!) of every coefficient (F K,)."""
+    return np.tile([factorial(a) ** -0.5 for a in multi_indices(rec.dim, rec.reach)], rec.fields)
 
 
 def eliminate(scheme: Scheme, jac: Any, length: Any) -> Elimination:
@@ -65,38 +103,77 @@ def eliminate(scheme: Scheme, jac: Any, length: Any) -> Elimination:
     rec = scheme.rec
     matrix, lift = constraints(rec, jac, length)
     rows = matrix[np.array(rec.equation_rows)]
+    white = jnp.asarray(_whitening(rec))
     if scheme.method == "SSPH":
-        white = _blocks(jnp.asarray(whitening(rec.dim, rec.order)), rec.fields)
         return Elimination(white, jnp.zeros((white.shape[0], matrix.shape[0])), lift, rows)
+    low, _, first, _ = split(rec)
+    fitted = matrix if not rec.depth else matrix[first][:, low]
     if scheme.method == "S":
-        white = _blocks(jnp.asarray(whitening(rec.dim, rec.order)), rec.fields)
         if scheme.lost:
-            return _of_lower_rank(scheme, matrix, lift, length, white, rows)
-        z, q = null_space(matrix @ white)
-        return Elimination(white @ z, white @ q, lift, rows)
-    order = np.concatenate([scheme.free, np.setdiff1d(_all_free(scheme), scheme.free)]).astype(int)
-    z, q = substitution(matrix, order, np.array(scheme.dependent))
-    return Elimination(z[:, : len(scheme.free)], q, lift, rows)
+            z, q, lift = _of_lower_rank(scheme, fitted, lift, length, white)
+        else:
+            z, q = null_space(fitted @ white)
+        z, q = white @ z, white @ q
+    else:
+        order = np.concatenate([scheme.free, np.setdiff1d(_all_free(scheme), scheme.free)]).astype(int)
+        z, q = substitution(fitted, order, np.array(scheme.dependent))
+        z = z[:, : len(scheme.free)]
+    if rec.depth:
+        z, q = _deepened(scheme, matrix, z, q)
+    return Elimination(z, q, lift, rows)
 
 
-def _of_lower_rank(scheme: Scheme, matrix: Any, lift: Any, length: Any, white: Any, rows: Any) -> Elimination:
-    """The elimination where some rows add nothing: by those that do, the largest first."""
+def _deepened(scheme: Scheme, matrix: Any, basis: Any, particular: Any) -> tuple[Any, Any]:
+    """Local solutions (F K, free) and (F K, rows) of all degrees, from those of the fit's."""
+    rec = scheme.rec
+    low, high, first, deeper = split(rec)
+    size = jnp.asarray(_fischer(rec)[high])
+    across, deep = matrix[deeper][:, low], matrix[deeper][:, high] * size
+    unit = _row_lengths(deep, jnp)[:, None]
+    wanted = jnp.concatenate([-across @ basis, -across @ particular, jnp.eye(len(deeper))], axis=1) / unit
+    spread = jnp.concatenate([deep / unit, _slack(scheme)], axis=1)
+    tail = size[:, None] * min_norm(spread.T, wanted)[: len(high)]
+    free, count = basis.shape[1], rec.fields * rec.size
+    whole = jnp.zeros((count, free), basis.dtype).at[low].set(basis).at[high].set(tail[:, :free])
+    source = jnp.zeros((count, rec.n_rows), basis.dtype).at[np.ix_(low, first)].set(particular)
+    return whole, source.at[np.ix_(high, np.concatenate([first, deeper]))].set(tail[:, free:])
+
+
+def _row_lengths(matrix: Any, xp: Any) -> Any:
+    """The lengths of the deep parts of rows of unit length; where they are only rounding, none of it counts."""
+    return xp.maximum(xp.sqrt(xp.sum(matrix**2, axis=1)), FAINT)
+
+
+def _slack(scheme: Scheme) -> np.ndarray:
+    """What every deep equation may be missed by: columns of the ridge, none where the tail is well determined.
+
+    Where convection outweighs diffusion within a support, the deep equations speak of the fit's own coefficients, and
+    the tail that would meet them exactly grows as the Peclet number to the power of the depth. The ridge bounds it:
+    measured at cell Peclet numbers from 5 to 1000, and without effect on elliptic operators.
+    """
+    n = len(split(scheme.rec)[3])
+    return np.zeros((n, 0)) if scheme.flat else np.sqrt(RIDGE) * np.eye(n)
+
+
+def _of_lower_rank(scheme: Scheme, fitted: Any, lift: Any, length: Any, white: Any) -> tuple[Any, Any, Any]:
+    """Null space, pseudo-inverse and factors where some rows add nothing: by those that do, the largest first."""
     # Rows of unit length hide that rounding is all there is of one.
     rec = scheme.rec
+    first = split(rec)[2]
     size = row_lifts(rec, length) / lift
     equation = np.array([e for e, _ in rec.row_index])
     largest = jnp.stack([jnp.max(jnp.where(equation == e, size, 0.0)) for e in range(len(rec.levels))])[equation]
     small = size < SMALL * largest
     damped = jnp.where(small, size / jnp.where(largest > 0, largest, 1.0), 1.0)
-    wide = (damped[:, None] * matrix) @ white
-    chosen = independent(wide, len(matrix) - scheme.lost)
+    wide = (damped[first][:, None] * fitted) @ white
+    chosen = independent(wide, len(first) - scheme.lost)
     z, q = null_space(chosen @ wide)
-    return Elimination(white @ z, white @ (q @ chosen), damped * lift, rows)
+    return z, q @ chosen, damped * lift
 
 
 def eliminate_on_host(scheme: Scheme, jac: np.ndarray, length: float = 1.0) -> Elimination:
     """:func:`eliminate` in numpy, where one elimination serves many particles; kept for later."""
-    bare = Scheme(scheme.method, scheme.rec, scheme.free, scheme.dependent)
+    bare = Scheme(scheme.method, scheme.rec, scheme.free, scheme.dependent, flat=scheme.flat)
     return _eliminated_once(bare, jac.tobytes(), jac.shape, jac.dtype.str, length)
 
 
@@ -114,17 +191,40 @@ def _eliminated(scheme: Scheme, jac: np.ndarray, length: float) -> Elimination:
     rec = scheme.rec
     matrix, lift = constraints(rec, jac, length, np)
     rows = matrix[np.array(rec.equation_rows)]
-    white = np.kron(np.eye(rec.fields), whitening(rec.dim, rec.order))
+    white = _whitening(rec)
     if scheme.method == "SSPH":
         return Elimination(white, np.zeros((white.shape[0], len(matrix))), lift, rows)
+    low, _, first, _ = split(rec)
+    fitted = matrix[np.ix_(first, low)] if rec.depth else matrix
     if scheme.method == "S":
-        return Elimination(*_refined(matrix, white), lift, rows)
-    free, dependent = np.array(scheme.free), np.array(scheme.dependent, int)
-    basis, particular = np.zeros((rec.size, len(free))), np.zeros((rec.size, len(matrix)))
-    particular[dependent] = np.linalg.inv(matrix[:, dependent])
-    basis[free, np.arange(len(free))] = 1.0
-    basis[dependent] = -particular[dependent] @ matrix[:, free]
+        basis, particular = _refined(fitted, white)
+    else:
+        free, dependent = np.array(scheme.free), np.array(scheme.dependent, int)
+        basis, particular = np.zeros((fitted.shape[1], len(free))), np.zeros(fitted.T.shape)
+        particular[dependent] = np.linalg.inv(fitted[:, dependent])
+        basis[free, np.arange(len(free))] = 1.0
+        basis[dependent] = -particular[dependent] @ fitted[:, free]
+    if rec.depth:
+        basis, particular = _deepened_on_host(scheme, matrix, basis, particular)
     return Elimination(basis, particular, lift, rows)
+
+
+def _deepened_on_host(
+    scheme: Scheme, matrix: np.ndarray, basis: np.ndarray, particular: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    rec = scheme.rec
+    low, high, first, deeper = split(rec)
+    size = _fischer(rec)[high]
+    deep = matrix[np.ix_(deeper, high)] * size
+    unit = _row_lengths(deep, np)
+    spread = np.concatenate([deep / unit[:, None], _slack(scheme)], axis=1)
+    _, inverse = _refined(spread, np.eye(spread.shape[1]))
+    extension, across = size[:, None] * inverse[: len(high)] / unit, matrix[np.ix_(deeper, low)]
+    whole, source = np.zeros((matrix.shape[1], basis.shape[1])), np.zeros(matrix.T.shape)
+    whole[low], source[np.ix_(low, first)] = basis, particular
+    whole[high], source[np.ix_(high, first)] = -extension @ (across @ basis), -extension @ (across @ particular)
+    source[np.ix_(high, deeper)] = extension
+    return whole, source
 
 
 def _refined(matrix: np.ndarray, white: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -144,4 +244,4 @@ def _refined(matrix: np.ndarray, white: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def _all_free(scheme: Scheme) -> np.ndarray:
-    return np.setdiff1d(np.arange(scheme.rec.size), scheme.dependent)
+    return np.setdiff1d(np.arange(len(split(scheme.rec)[0])), scheme.dependent)

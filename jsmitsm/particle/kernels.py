@@ -10,6 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm.runtime.arrays import Array, ArrayLike
+from jsmitsm.runtime.errors import did_you_mean, in_words, short
+from jsmitsm.runtime.snapshot import ScalarFunction, snapshot
 from jsmitsm.runtime.tracers import is_traced
 
 # A particle that sits on the edge of a support belongs to it; rounding must not decide that.
@@ -68,6 +70,20 @@ class Kernel:
         """The weight at the scaled distance ``r`` (any shape), zero outside the support."""
         return jnp.where(r <= self.d * EDGE, self.profile(r), 0.0)
 
+    def recorded(self) -> Kernel:
+        """The same kernel with the user's profile as it is now: compiled programs are kept under what it computes."""
+        if self._profile is None or isinstance(self._profile, ScalarFunction):
+            return self
+        profile = ScalarFunction(self._profile, *(() if self.params is None else (self.params,)))
+        return self if profile.traced else self._with(profile)
+
+    def as_written(self) -> Kernel:
+        """The same kernel with the profile that the user wrote."""
+        return self._with(self._profile.function) if isinstance(self._profile, ScalarFunction) else self
+
+    def _with(self, profile: Callable[..., Any]) -> Kernel:
+        return type(self).tree_unflatten(profile, (self.h, self.d, self.params))
+
     @property
     def length(self) -> float | Array:
         """The length by which offsets are divided, of the size of the support: a scalar or (N,), like ``h``."""
@@ -82,7 +98,8 @@ class Kernel:
         """The same kernel with other ``changes``: ``h``, ``d`` or ``params``; ValueError for other names."""
         unknown = sorted(set(changes) - {"h", "d", "params"})
         if unknown:
-            raise ValueError(f"{unknown[0]}: no parameter of {type(self).__name__}; it has 'h', 'd' and 'params'")
+            raise ValueError(f"{unknown[0]}: no parameter of {type(self).__name__}; it has 'h', 'd' and 'params'"
+                             + did_you_mean(unknown[0], ("h", "d", "params")))  # fmt: skip
         _, aux = self.tree_flatten()
         for name, dims in (("h", (0, 1)), ("d", (0,))):
             if name in changes:
@@ -148,9 +165,9 @@ class Gaussian(_Named):
         return jnp.exp(-(r**2))
 
 
-def fitted(farthest: Any) -> Gaussian:
-    """What stands for a kernel where none is given: it has fallen to exp(-4) at the farthest neighbour."""
-    return Gaussian.tree_unflatten(None, (farthest / 2.0, 2.0, None))
+def fitted(farthest: Any, decay: float = 2.0) -> Gaussian:
+    """What stands for a kernel where none is given: it has fallen to exp(-decay^2) at the farthest neighbour."""
+    return Gaussian.tree_unflatten(None, (farthest / decay, decay, None))
 
 
 @jax.tree_util.register_pytree_node_class
@@ -207,8 +224,8 @@ def _checked(value: Any, name: str, dims: tuple[int, ...]) -> Any:
         array = np.asarray(value)
         if array.dtype.kind not in "fiu":
             raise TypeError
-    except (TypeError, ValueError):
-        raise ValueError(f"{name}: expected a positive number, got {value!r}") from None
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError(f"{name}: expected a positive number, got {short(value)}") from None
     if array.ndim not in dims or not array.size:
         kinds = "a scalar or an (N,) array" if 1 in dims else "a scalar"
         raise ValueError(f"{name}: expected {kinds}, got an array of shape {array.shape}")
@@ -223,9 +240,9 @@ def _check_profile(kernel: Kernel) -> None:
     """Call a user's profile once without numbers: its signature and shape come to light."""
     said = "profile: expected a jax.numpy function of the scaled distance r (and of params, where given)"
     try:
-        shape = np.shape(jax.eval_shape(kernel.profile, jax.ShapeDtypeStruct((), jnp.result_type(float))))
+        shape = np.shape(snapshot(kernel.profile, jax.ShapeDtypeStruct((), jnp.result_type(float)))[1])
     except Exception as error:
-        raise ValueError(f"{said}, but calling it failed: {error}") from error
+        raise ValueError(f"{said}, but calling it failed: {in_words(error)}") from error
     if shape != ():
         raise ValueError(f"{said} that returns a scalar for a scalar, got shape {shape}")
 

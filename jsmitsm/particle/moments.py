@@ -16,7 +16,7 @@ import numpy as np
 from jsmitsm.particle.elimination import Elimination, Scheme
 from jsmitsm.particle.kernels import EDGE, Kernel, fitted
 from jsmitsm.particle.polynomials import FEW, Combinations, functionals, monomials
-from jsmitsm.particle.recursion import Recursion
+from jsmitsm.particle.recursion import Recursion, split
 from jsmitsm.particle.small_systems import (
     general_inverse,
     gram_inverse,
@@ -54,17 +54,17 @@ class Support(NamedTuple):
     kernel: Kernel  # the particle's own
 
 
-def support(points: Any, i: Any, neighbours: Any, kernel: Kernel | None) -> Support:
+def support(points: Any, i: Any, neighbours: Any, kernel: Kernel | None, decay: float = 2.0) -> Support:
     """Offsets and weights of one particle's neighbours.
 
-    Without a kernel the weight is exp(-(2 r / r_max)^2), r_max the distance of the farthest.
+    Without a kernel the weight is exp(-(decay r / r_max)^2), r_max the distance of the farthest.
     """
     valid = neighbours >= 0
     offset = points[jnp.where(valid, neighbours, i)] - points[i]
     square = jnp.sum(offset**2, axis=1)
     apart = square > 0
     distance = jnp.where(apart, jnp.sqrt(jnp.where(apart, square, 1.0)), 0.0)
-    own = kernel.at(i) if kernel is not None else fitted(jnp.max(distance))
+    own = kernel.at(i) if kernel is not None else fitted(jnp.max(distance), decay)
     inside = valid & (distance <= own.d * own.h * EDGE) if kernel is not None else valid
     weight = jnp.maximum(own.profile(distance / own.h), 0.0)
     return Support(offset / own.length, jnp.where(inside, weight, 0.0), inside, own.length, own)
@@ -113,10 +113,11 @@ def local_system(
     rec = scheme.rec
     ns, fields = len(near.offset), rec.fields
     weight = near.weight.at[0].set(0.0) if skip_self else near.weight
-    if values is None and rec.size <= FEW and fields == 1 and not scheme.n_data:
-        values = Combinations(near.offset, rec.order)
+    plain = values is None and fields == 1 and not scheme.n_data
+    if plain and rec.size <= FEW:
+        values = Combinations(near.offset, rec.reach)
     else:
-        p = monomials(near.offset, rec.order)
+        p = monomials(near.offset, rec.reach)
     if values is None:
         values = jnp.einsum("gk,fh->gfhk", p, jnp.eye(fields)).reshape(ns * fields, -1) if fields > 1 else p
     weights = jnp.repeat(weight, fields)
@@ -135,7 +136,14 @@ def local_system(
         z, own_solve = null_space(own_rows @ basis)
         basis = basis @ z
         tests = None if tests is None else tests @ z
-    phi = values @ basis if isinstance(values, Combinations) else product(values, basis)
+    low = split(rec)[0]
+    fitted_values: Any = values
+    if scheme.flat and rec.depth:
+        short = plain and len(low) <= FEW
+        fitted_values, basis_fit = Combinations(near.offset, rec.order) if short else values[:, low], basis[low]
+    else:
+        basis_fit = basis
+    phi = fitted_values @ basis_fit if isinstance(fitted_values, Combinations) else product(fitted_values, basis_fit)
     return System(solution, basis, own_rows, own_scale, own_solve, values, phi, weights, tests, data_scale)
 
 
@@ -284,5 +292,5 @@ def coefficients(
     else:
         free = general_inverse(system.tests.T @ system.phi) @ (system.tests.T @ rest)
     scaled_u = (part + system.reduced @ free).reshape(fields, rec.size)
-    degrees = np.array([float(sum(a)) for a in multi_indices(rec.dim, rec.order)])
+    degrees = np.array([float(sum(a)) for a in multi_indices(rec.dim, rec.reach)])
     return scaled_u * near.length ** (-degrees) / power[:, None]

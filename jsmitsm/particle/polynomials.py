@@ -99,7 +99,7 @@ def functionals(slots: Sequence[Slot], coef: Any, p: Any, rec: Recursion, length
     """
     rows = jnp.zeros((coef.shape[0], rec.fields * rec.size), p.dtype)
     for s, (f, b) in enumerate(slots):
-        lower, factor = derivative_table(rec.dim, rec.order, b)
+        lower, factor = derivative_table(rec.dim, rec.reach, b)
         row = p[lower] * factor * length ** (-sum(b) - rec.weights[f])
         rows = rows.at[:, f * rec.size : (f + 1) * rec.size].add(coef[:, s, None] * row)
     sizes = jnp.stack([jnp.abs(coef[:, s]) * length ** (-sum(b) - rec.weights[f]) for s, (f, b) in enumerate(slots)])

@@ -36,6 +36,7 @@ class Recursion:
 
     Attributes
     ----------
+    order, depth : the fit has the free coefficients of degree ``order``; the recursion goes ``depth`` degrees deeper.
     levels : per equation, the power of length that makes its leading terms free of units.
     weights : per field, the power of length that balances it against the others
         (a pressure counts one derivative less than a velocity).
@@ -50,11 +51,22 @@ class Recursion:
     weights: tuple[int, ...]
     degrees: tuple[int, ...]
     pattern: tuple[tuple[bool, ...], ...]
+    depth: int = 0
+
+    @property
+    def reach(self) -> int:
+        """The degree of the local polynomials: that of the fit and what the recursion adds."""
+        return self.order + self.depth
+
+    @property
+    def orders(self) -> tuple[int, ...]:
+        """The order of each equation."""
+        return tuple(self.reach - q for q in self.degrees)
 
     @property
     def size(self) -> int:
         """Taylor coefficients of one field, K."""
-        return len(multi_indices(self.dim, self.order))
+        return len(multi_indices(self.dim, self.reach))
 
     @property
     def degree(self) -> int:
@@ -87,9 +99,9 @@ class Recursion:
 
 
 def recursion(
-    dim: int, order: int, fields: int, slots: Sequence[Slot], pattern: np.ndarray, orders: Sequence[int]
+    dim: int, order: int, fields: int, slots: Sequence[Slot], pattern: np.ndarray, orders: Sequence[int], depth: int = 0
 ) -> Recursion:
-    """Lay out the constraints of a traced operator for Taylor expansions of degree ``order``."""
+    """Lay out the constraints of a traced operator for fits of degree ``order`` and ``depth`` more."""
     weights = [0] * fields
     for f in range(fields):
         gaps = [
@@ -101,7 +113,7 @@ def recursion(
     levels = [max(sum(b) + weights[f] for s, (f, b) in enumerate(slots) if pattern[e, s]) for e in range(len(orders))]
     return Recursion(
         dim, order, fields, tuple(slots), tuple(levels), tuple(weights),
-        tuple(order - m for m in orders), tuple(tuple(bool(v) for v in row) for row in pattern),
+        tuple(order + depth - m for m in orders), tuple(tuple(bool(v) for v in row) for row in pattern), depth,
     )  # fmt: skip
 
 
@@ -112,9 +124,23 @@ def _rows(rec: Recursion) -> list[tuple[int, tuple[int, ...]]]:
 
 
 @lru_cache(maxsize=64)
+def split(rec: Recursion) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Columns and rows of the fit, and those that are deeper: (low, high) columns, (low, high) rows.
+
+    A field counts with its weight, so that no row of the fit reaches a column beyond it. Without depth every
+    coefficient up to the order takes part, as in the paper.
+    """
+    degrees = np.array([sum(a) for a in multi_indices(rec.dim, rec.reach)])
+    weighted = np.concatenate([degrees + (w if rec.depth else 0) for w in rec.weights])
+    behind = np.array([sum(c) + rec.orders[e] for e, c in _rows(rec)])
+    columns = np.flatnonzero(weighted <= rec.order), np.flatnonzero((weighted > rec.order) & (weighted <= rec.reach))
+    return *columns, np.flatnonzero(behind <= rec.order), np.flatnonzero(behind > rec.order)
+
+
+@lru_cache(maxsize=64)
 def _entries(rec: Recursion) -> dict[str, np.ndarray]:
     """Every term of the constraints: its place in C, its coefficient, factor and power of length."""
-    place, taylor = index_of(rec.dim, rec.order), index_of(rec.dim, rec.degree)
+    place, taylor = index_of(rec.dim, rec.reach), index_of(rec.dim, rec.degree)
     found = []
     for row, (e, c) in enumerate(_rows(rec)):
         for s, (f, b) in enumerate(rec.slots):
@@ -191,7 +217,7 @@ def free_indices(rec: Recursion, jac0: np.ndarray | None) -> tuple[np.ndarray, n
     jac0 (S, N): the operator's coefficients at the particles; None where they are traced, then
     the last axis that has such a derivative is taken.
     """
-    m = rec.order - rec.degrees[0]
+    m = rec.orders[0]
     sizes = []
     for axis in range(rec.dim):
         pure = tuple(m if k == axis else 0 for k in range(rec.dim))

@@ -1,11 +1,19 @@
-"""The package's own exceptions."""
+"""The package's own exceptions, and the words in which others' are told."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import difflib
+import re
+import sys
+from collections.abc import Iterable, Sequence
 from typing import Any
 
+import jax
 import numpy as np
+
+# What a user's function may raise when it is called.
+IN_FUNCTIONS = (TypeError, ValueError, IndexError, AttributeError, ArithmeticError, RecursionError)
+_LONGEST = 200  # letters of a value that a message quotes
 
 
 class SolveError(RuntimeError):
@@ -39,6 +47,56 @@ def some(index: Any, most: int = 6) -> str:
     '[3, 1, ...]'
     """
     return f"[{', '.join(str(int(i)) for i in index[:most])}{', ...' if len(index) > most else ''}]"
+
+
+def did_you_mean(name: Any, known: Iterable[str]) -> str:
+    """The end of a message that refuses a name: the known one that is nearly the same, if there is one.
+
+    >>> did_you_mean("lefft", ["left", "right"]), did_you_mean("Left", ["left"]), did_you_mean("far", ["left", "right"])
+    ("; did you mean 'left'?", "; did you mean 'left'?", '')
+    """
+    lower = {k.lower(): k for k in known if k != name}
+    close = difflib.get_close_matches(str(name).lower(), lower, 1)
+    return f"; did you mean {lower[close[0]]!r}?" if close else ""
+
+
+def short(value: Any) -> str:
+    """A value as a message quotes it, a traced one in words.
+
+    >>> short(10**400), short([1, 2])
+    ('a whole number of 401 digits', '[1, 2]')
+    """
+    if isinstance(value, int) and value.bit_length() > 128:
+        return f"a whole number of {int(value.bit_length() * 0.30103) + 1} digits"
+    try:
+        text = _without_tracers(repr(value))
+    except ValueError:  # whole numbers of thousands of digits within
+        return f"a {type(value).__name__} of numbers without end"
+    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."
+
+
+def _without_tracers(text: str) -> str:
+    return re.sub(r"'?\b\w*Tracer\b'?(\([^()]*\)|<[^<>]*>| object)?", "a traced array", text)
+
+
+def in_words(error: Exception) -> str:
+    """What went wrong in a user's function, with the remedy where the message of Python or JAX has none."""
+    text = _without_tracers(str(error))
+    if isinstance(error, jax.errors.ConcretizationTypeError | jax.errors.TracerArrayConversionError):
+        return (f"{text.splitlines()[0]} It must be written in jax.numpy: jnp.sin for np.sin or math.sin, "
+                "jnp.where for an if")  # fmt: skip
+    if isinstance(error, IndexError):
+        return (f"{text}; x is one point of shape (D,), x[0] its first coordinate; u(x) is a number, and a vector (F,) "
+                "with js.Problem(..., fields=F)")  # fmt: skip
+    if isinstance(error, OverflowError):
+        return ("a number too large for floats, which end at 1.8e308, or for whole numbers of 64 bits; write large "
+                "ones as floats (1e20 for 10**20), and divide the equation by a number of their size")  # fmt: skip
+    if isinstance(error, RecursionError):
+        return (f"functions within functions beyond Python's limit of {sys.getrecursionlimit()} calls; write a sum or "
+                "a loop in one function in place of closures in each other, or call sys.setrecursionlimit")  # fmt: skip
+    if isinstance(error, AttributeError) and error.name is not None:
+        return f"{text}{did_you_mean(error.name, dir(error.obj))}"
+    return text
 
 
 def refuse_masked(value: Any, name: str) -> None:

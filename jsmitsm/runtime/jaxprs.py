@@ -8,7 +8,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Literal
+from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
 # Piecewise constant in their arguments: the degree 0 decides.
 DISCRETE = frozenset(
@@ -45,6 +45,24 @@ def bind(eqn: Any, *args: Any) -> list[Any]:
         args, params = (*params[0], *args), params[1]
     out = eqn.primitive.bind(*args, **params)
     return list(out) if eqn.primitive.multiple_results else [out]
+
+
+def inner_jaxprs(eqn: Any) -> list[Jaxpr]:
+    """Every jaxpr among the parameters of an operation."""
+    found: list[Jaxpr] = []
+
+    def look(value: Any) -> None:
+        if isinstance(value, ClosedJaxpr):
+            found.append(value.jaxpr)
+        elif isinstance(value, Jaxpr):
+            found.append(value)
+        elif isinstance(value, tuple | list):
+            for v in value:
+                look(v)
+
+    for value in eqn.params.values():
+        look(value)
+    return found
 
 
 def levels(jaxpr: Any, wanted: Sequence[int]) -> tuple[tuple[Any, int], ...]:

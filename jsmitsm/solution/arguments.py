@@ -12,7 +12,7 @@ from jsmitsm.discretization.layout import Discretization, discretize
 from jsmitsm.equation.problem import Problem
 from jsmitsm.linear.linsolve import SOLVERS, Solver
 from jsmitsm.particle.kernels import Kernel
-from jsmitsm.runtime.errors import refuse_masked
+from jsmitsm.runtime.errors import did_you_mean, refuse_masked, short
 from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.taylor.multi_indices import HIGHEST
 
@@ -20,7 +20,11 @@ Method: TypeAlias = Literal["I", "II", "III", "S", "SSPH"]
 """What ``method`` may be, a type for annotations."""
 Formulation: TypeAlias = Literal["auto", "loo", "lsq"]
 """What ``formulation`` may be, a type for annotations."""
+Depth: TypeAlias = int | Literal["auto"]
+"""What ``depth`` may be, a type for annotations."""
 METHODS, FORMULATIONS = get_args(Method), get_args(Formulation)
+# Beyond so many degrees round-off of the extension outweighs its gain.
+DEEPEST = 4
 
 
 class SolveOptions(TypedDict, total=False):
@@ -28,6 +32,7 @@ class SolveOptions(TypedDict, total=False):
 
     method: Method
     order: int
+    depth: Depth
     stencils: Stencils | None
     basis_terms: int | None
     formulation: Formulation
@@ -38,14 +43,16 @@ class SolveOptions(TypedDict, total=False):
 def discretized(
     problem: Problem, cloud: Cloud, method: str = "S", order: int = 4, kernel: Kernel | None = None,
     stencils: Stencils | None = None, basis_terms: int | None = None, formulation: str = "auto", solver: str = "auto",
+    depth: Depth = 0,
 ) -> Discretization:  # fmt: skip
     """Checked arguments, discretised."""
-    check(problem, cloud, method, order, kernel, stencils, formulation, solver)
-    return discretize(problem, cloud, method, order, kernel, stencils, basis_terms)
+    check(problem, cloud, method, order, kernel, stencils, formulation, solver, depth=depth)
+    return discretize(problem, cloud, method, order, kernel, stencils, basis_terms, depth=depth)
 
 
 def check(
-    problem, cloud, method, order, kernel, stencils, formulation="auto", solver="auto", u0=None, throw=True
+    problem, cloud, method, order, kernel, stencils, formulation="auto", solver="auto", u0=None, throw=True,
+    depth=0,
 ) -> None:
     """Arguments of :func:`solve` that can be judged before any work."""
     for value, kind, name in ((problem, Problem, "problem"), (cloud, Cloud, "cloud")):
@@ -61,17 +68,33 @@ def check(
         (method, METHODS, "method"), (formulation, FORMULATIONS, "formulation"), (solver, SOLVERS, "solver")
     ):  # fmt: skip
         if value not in known:
-            raise ValueError(f"{name}: {value!r} is none of {', '.join(map(repr, known))}")
+            raise ValueError(f"{name}: {value!r} is none of {', '.join(map(repr, known))}{did_you_mean(value, known)}")
     if formulation == "lsq" and method != "S":
         raise ValueError(f'formulation: "lsq" is a form of method S, not of {method!r}; use method="S" or "loo"')
     if stencils is not None and any(c.kind == "periodic" for cs in problem.bcs.values() for c in cs):
         raise ValueError("stencils: those of a cloud do not reach periodic images; leave stencils out")
     if not isinstance(throw, (bool, np.bool_)):
-        raise ValueError(f"throw: expected True or False, got {throw!r}")
+        raise ValueError(f"throw: expected True or False, got {short(throw)}")
     _check_start(u0, (len(cloud), problem.fields))
     if isinstance(order, bool) or not isinstance(order, (int, np.integer)) or not 1 <= order <= HIGHEST:
         raise ValueError(
-            f"order: expected a whole number from 1 to {HIGHEST}, the degree of the expansions, got {order!r}"
+            f"order: expected a whole number from 1 to {HIGHEST}, the degree of the expansions, got {short(order)}"
+        )
+    _check_depth(depth, method, order)
+
+
+def _check_depth(depth: Any, method: str, order: Any) -> None:
+    """Degrees beyond the order: "auto" or a whole number."""
+    if isinstance(depth, str) and depth == "auto":
+        return
+    if isinstance(depth, (bool, np.bool_)) or not isinstance(depth, (int, np.integer)) or depth < 0:
+        raise ValueError(f'depth: expected "auto" or a whole number from 0, degrees beyond the order, got {depth!r}')
+    if depth and method == "SSPH":
+        raise ValueError(f"depth: SSPH has no recursion to take {depth} degrees further; use depth=0, or method=\"S\"")
+    if order + depth > HIGHEST + DEEPEST:
+        raise ValueError(
+            f"depth: order {order} and depth {depth} make polynomials of degree {order + depth}, and "
+            f"{HIGHEST + DEEPEST} is the highest; beyond depth {DEEPEST} nothing is gained"
         )
 
 
@@ -84,8 +107,8 @@ def _check_start(u0: Any, shape: tuple[int, int]) -> None:
         if np.iscomplexobj(u0):
             raise TypeError
         values = np.asarray(u0, float)
-    except (TypeError, ValueError):
-        raise ValueError(f"u0: expected a function of x or an array, got {u0!r}") from None
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError(f"u0: expected a function of x or an array, got {short(u0)}") from None
     if values.shape not in (shape, shape[:1]):
         raise ValueError(f"u0: expected a function, ({shape[0]},) or {shape}, got shape {values.shape}")
     if not np.isfinite(values).all():

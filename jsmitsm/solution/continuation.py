@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, Unpack
+from typing import Any, Literal, Unpack, overload
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from jsmitsm.runtime.arrays import Array, ValueOrFunction
 from jsmitsm.runtime.errors import SolveError
 from jsmitsm.runtime.progress import bar
 from jsmitsm.solution.arguments import SolveOptions
+from jsmitsm.solution.branch import Branch, follow
 from jsmitsm.solution.solution import Solution
 from jsmitsm.solution.solve import solve
 
@@ -28,12 +29,29 @@ class StageOptions(SolveOptions, total=False):
 _HALVINGS = 6
 
 
+@overload
+def continuation(
+    problem: Callable[[float], Problem], cloud: Cloud, parameters: Sequence[float] | Array, *,
+    u0: ValueOrFunction | None = None, arclength: Literal[False] = False, steps: int = 100,
+    **options: Unpack[StageOptions],
+) -> list[Solution]: ...  # fmt: skip
+
+
+@overload
+def continuation(
+    problem: Callable[[float], Problem], cloud: Cloud, parameters: Sequence[float] | Array, *,
+    u0: ValueOrFunction | None = None, arclength: Literal[True], steps: int = 100, **options: Unpack[StageOptions],
+) -> Branch: ...  # fmt: skip
+
+
 def continuation(
     problem: Callable[[float], Problem],
     cloud: Cloud,
     parameters: Sequence[float] | Array,
     *,
     u0: ValueOrFunction | None = None,
+    arclength: bool = False,
+    steps: int = 100,
     **options: Unpack[StageOptions],
 ) -> list[Solution]:
     """Solve ``problem(parameter)`` for a sequence of parameters, each from the solution before.
@@ -43,17 +61,27 @@ def continuation(
     problem : function of one number that returns the problem to solve.
     parameters : the stages, in the order in which to go; two or more.
     u0 : start of the first stage, as in :func:`jsmitsm.solve`; ``options`` are passed to it.
+    arclength : follow the branch of solutions by its arc length (Keller 1977), which passes turning
+        points. The second parameter says in which direction to set out, and each is that at which the
+        branch passes it after the one before: [1.0, 2.0, 2.0] are the solutions at 2 before the turning
+        point and behind it.
+    steps : with ``arclength``, the most steps along the branch; it ends there, or where the last
+        parameter was passed.
 
     Returns
     -------
     list of Solution : one for each of ``parameters``. Where Newton's method fails, the way to the
-        next parameter is halved.
+        next parameter is halved. With ``arclength`` a list with attributes, of the solutions at those
+        of the parameters that were reached: ``parameters`` (these), ``branch``, a list of (parameter,
+        Solution) of all steps, and ``folds``, the parameters at which the branch turns back.
 
     Raises
     ------
+    ValueError
+        For bad parameters, with what came and what was expected.
     SolveError
         With the last parameter reached if halving does not help, as at a turning point, beyond
-        which there is no solution.
+        which there is no solution; with ``arclength``, where the branch ends.
 
     Examples
     --------
@@ -65,6 +93,9 @@ def continuation(
     >>> sols = js.continuation(bratu, js.interval(0.0, 1.0, 21), [1.0, 2.0, 3.0])
     >>> [round(float(sol.u[10]), 4) for sol in sols]
     [0.1405, 0.329, 0.6401]
+    >>> around = js.continuation(bratu, js.interval(0.0, 1.0, 21), [1.0, 2.0, 2.0], arclength=True)
+    >>> [round(float(sol.u[10]), 2) for sol in around], round(around.folds[0], 3)
+    ([0.14, 0.33, 2.9], 3.514)
     """
     values = np.asarray(parameters, float)
     if values.ndim != 1 or len(values) < 2 or not np.isfinite(values).all():
@@ -74,6 +105,15 @@ def continuation(
             f"problem: expected a function of the parameter that returns a js.Problem, got {type(problem).__name__}"
         )
     options["throw"] = True
+    if arclength:
+        if values[0] == values[1]:
+            raise ValueError(
+                f"parameters: the first two say in which direction to follow the branch, and both are {values[0]:.6g}"
+            )
+        if isinstance(steps, bool) or not isinstance(steps, int | np.integer) or steps < 1:
+            raise ValueError(f"steps: expected a whole number from 1, the most steps along the branch, got {steps!r}")
+        with bar("continuation", len(values)) as shown:
+            return follow(problem, cloud, values, u0, int(steps), dict(options), shown)
     with bar("continuation", len(values)) as shown:
         sols = [solve(problem(float(values[0])), cloud, u0=u0, **options)]
         shown.update()
@@ -94,7 +134,8 @@ def _onward(problem: Any, cloud: Cloud, at: float, end: float, sol: Solution, op
             step /= 2.0
             if abs(step) < smallest:
                 raise SolveError(
-                    f"continuation stopped at the parameter {at:.6g} on the way to {end:.6g}: {error.args[0]}",
+                    f"continuation stopped at the parameter {at:.6g} on the way to {end:.6g} (arclength=True "
+                    f"passes turning points): {error.args[0]}",
                     error.particles,
                 ) from error
         else:

@@ -80,11 +80,12 @@ def _higher(fit: Fit, low: Discretization) -> tuple[Discretization, Numbers]:
             "error_estimate: the points are traced by a JAX transform, and the wider stencils it needs are found on "
             "the host; ask for it outside the transform"
         )
-    high = discretized(fit.problem, Cloud(np.asarray(host), low.cloud.groups, low.cloud.normals), "S", order)
+    cloud = Cloud(np.asarray(host), low.cloud.groups, low.cloud.normals)
+    high = discretized(fit.problem, cloud, "S", order, depth=low.rec.depth)
     high.cloud = fit.cloud
     taylor = fit.taylor
     if taylor is not None:
-        more = len(multi_indices(low.rec.dim, order)) - taylor.shape[2]
+        more = len(multi_indices(low.rec.dim, high.rec.reach)) - taylor.shape[2]
         taylor = (jnp if is_traced(taylor) else np).pad(taylor, ((0, 0), (0, 0), (0, more)))
     return high, numbers(high, fit.problem, taylor)
 

@@ -19,7 +19,7 @@ from jsmitsm.linear.linsolve import Solver
 from jsmitsm.particle.kernels import Kernel
 from jsmitsm.runtime.progress import bar
 from jsmitsm.runtime.tracers import is_traced
-from jsmitsm.solution.arguments import Formulation, Method, check, discretized
+from jsmitsm.solution.arguments import Depth, Formulation, Method, check, discretized
 from jsmitsm.solution.fit import Fit, Recipe
 from jsmitsm.solution.run import Run
 from jsmitsm.solution.solution import Solution
@@ -51,7 +51,10 @@ class Factorization:
         old = self._disc
         method, order, kernel = old.scheme.method, old.rec.order, old.kernel
         check(problem, old.cloud, method, order, kernel, None)
-        disc = discretize(problem, old.cloud, method, order, kernel, Stencils(table(old), None), old.basis_terms)
+        disc = discretize(
+            problem, old.cloud, method, order, kernel, Stencils(table(old), None), old.basis_terms,
+            depth=old.rec.depth,
+        )
         if disc.scheme != old.scheme or not np.array_equal(disc.held, old.held):
             raise ValueError(
                 "problem: its operator or the kind of its conditions differs from the one that was factorised; "
@@ -82,7 +85,8 @@ class Factorization:
         traced = is_traced(values)
         if not traced:
             run.nums, run.values = nums, np.asarray(values)
-        recipe = Recipe(disc.scheme.method, disc.rec.order, disc.basis_terms, run.formulation, problem.fields)
+        rec = disc.rec
+        recipe = Recipe(disc.scheme.method, rec.order, disc.basis_terms, run.formulation, problem.fields, rec.depth)
         fit = Fit(problem, disc.cloud, disc.kernel, table(disc), None, recipe)
         fine = jnp.isfinite(values).all() if traced else good
         return Solution(values, disc.cloud, recipe, fit, fine, 1, run.stats(), report=None if traced else run)
@@ -104,14 +108,14 @@ def _same(x: Any, y: Any) -> bool:
 def factorize(
     problem: Problem, cloud: Cloud, *, method: Method = "S", order: int = 4, kernel: Kernel | None = None,
     stencils: Stencils | None = None, basis_terms: int | None = None, formulation: Formulation = "auto",
-    solver: Solver = "auto",
+    solver: Solver = "auto", depth: Depth = 0,
 ) -> Factorization:  # fmt: skip
     """Prepare a linear problem for many right-hand sides.
 
     Returns an object whose ``solve(problem)`` reuses everything that a change of the source or of
     the values in the conditions leaves valid: neighbours, moment systems, ordering and factors.
 
-    ``method``, ``order``, ``kernel``, ``stencils``, ``basis_terms``, ``formulation`` and ``solver`` as for
+    ``method``, ``order``, ``kernel``, ``stencils``, ``basis_terms``, ``formulation``, ``solver`` and ``depth`` as for
     :func:`jsmitsm.solve`.
     Raises ValueError for a nonlinear problem: its matrix changes in every step.
 
@@ -127,7 +131,7 @@ def factorize(
     >>> round(float(ready.solve(heated(8.0)).u[5]), 10)
     1.0
     """
-    disc = discretized(problem, cloud, method, order, kernel, stencils, basis_terms, formulation, solver)
+    disc = discretized(problem, cloud, method, order, kernel, stencils, basis_terms, formulation, solver, depth)
     if not disc.linear:
         raise ValueError("problem: it is nonlinear, so its matrix changes in every step; use js.solve")
     return Factorization(disc, problem, solver, kernel is None and stencils is None, formulation)

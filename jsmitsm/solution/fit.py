@@ -27,6 +27,12 @@ class Recipe:
     basis_terms: int | None
     formulation: str
     fields: int
+    depth: int = 0
+
+    @property
+    def reach(self) -> int:
+        """The degree of the local polynomials."""
+        return self.order + self.depth
 
 
 @jax.tree_util.register_pytree_node_class
@@ -44,7 +50,7 @@ class Fit:
     def discretization(self) -> Discretization:
         near = Stencils(self.neighbours, None)
         r = self.recipe
-        return discretize(self.problem, self.cloud, r.method, r.order, self.kernel, near, r.basis_terms)
+        return discretize(self.problem, self.cloud, r.method, r.order, self.kernel, near, r.basis_terms, depth=r.depth)
 
     @bar("fitting")
     def coefficients(self, values: Any) -> Any:

@@ -131,7 +131,7 @@ def _condition(run: Any, values: np.ndarray, nums: Any, out: list[str], found: d
     if run.factor is None:
         return
     rec = run.disc.rec
-    order = max(rec.order - q for q in rec.degrees)
+    order = max(rec.orders)
     found["condition"] = run.factor.condition()
     usual = len(values) ** ((2 if run.formulation == "lsq" else 1) * order / rec.dim)
     found["excess"] = found["condition"] / usual

@@ -1,30 +1,44 @@
-"""Newton's method on the recursion: linearise at the local expansions, solve, fit them again."""
+"""Newton's method: it arrives from far, ends quadratically, and its end carries derivatives.
+
+The local fits solve the linearised recursion, so that a step from expansions U leads to values and expansions V with
+R(U) + R'(U) (V - U) = 0, for both together. What it lacks of a quadratic rate is the misfit of the fits, which falls
+with the order.
+"""
 
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jsmitsm.discretization.coefficients import numbers, slot_series
-from jsmitsm.discretization.held_particles import with_held_expansions
+from jsmitsm.discretization.coefficients import slot_series
 from jsmitsm.discretization.layout import refuse_jumps
-from jsmitsm.discretization.rows import all_coefficients
 from jsmitsm.equation.branches import FIELD
-from jsmitsm.equation.conditions import sample
-from jsmitsm.runtime.errors import SolveError
+from jsmitsm.runtime.errors import SolveError, some
 from jsmitsm.runtime.progress import bar
 from jsmitsm.runtime.tracers import concrete, is_traced
 from jsmitsm.solution.run import Run
-from jsmitsm.taylor.multi_indices import multi_indices
+from jsmitsm.solution.start import harmonic, start
+from jsmitsm.solution.steps import Frozen, Iterate, Record, advance, distance, mixed, raising, relaxed
 
-MOST = 50
-TOLERANCE = 1e-10
-# A step that must be cut below this does not lead on.
-SHORTEST = 1.0 / 64.0
+# Steps of one search. A step shorter than DONE of the solution is the last; shorter than GOOD it counts as converged.
+MOST, DONE, GOOD = 50, 1e-10, 1e-8
+# A damped step that must be cut below SHORTEST does not lead on, nor does a search of which so many steps were refused.
+SHORTEST, REFUSED = 1.0 / 16.0, 12
+# Round-off times this and the condition of the matrix may keep the steps from falling, up to a part ROUND_OFF of the
+# solution. Under jit, where no condition is known, steps below STALLED that do not fall are taken to be round-off.
+ROUNDING, ROUND_OFF, STALLED = 10 * np.finfo(float).eps, 1e-6, 1e-7
+# Steps of less than CLOSE of the solution that fall to no less than SLOW of the one before converge linearly, and are
+# mixed with up to DEPTH that came before.
+SLOW, CLOSE, DEPTH = 0.25, 1e-3, 4
+# Where only the first full step tells how large the solution is, it may be this much larger than that.
+WARY = 0.01
+NOTHING = "the equation says nothing"
+# So many full steps in the end, until one is this short.
+WANDERING, NEAR = 30, 1e-3
 
 
 def newton(run: Run, u0: Any) -> tuple[Any, Any, Any, Any]:
@@ -34,18 +48,20 @@ def newton(run: Run, u0: Any) -> tuple[Any, Any, Any, Any]:
     near the solution a step contracts errors of the expansions, and those of their derivatives
     alike, so that this is the implicit derivative and not that of the history.
     """
-    values, taylor = _start(run, u0)
-    one = _advance(run, taylor)
+    here, one = _first(run, Iterate(*start(run.disc, run.problem, u0)), u0 is None)
     if any(concrete(x) is None for x in one):
-        values, taylor, good, steps = _compiled(run, values, taylor)
+        values, taylor, good, steps = _compiled(run, here)
         rate = 0.1
     else:
         with bar("Newton steps") as shown:
-            values, taylor, good, steps, rate = _iterate(run, values, taylor, one, shown)
+            record = Record(run, shown)
+            (values, taylor), _, good, _ = _searched(record, here.numbers(), one.numbers())
+        run.changes = record.changes
+        steps, rate = record.steps, record.rate
     _refuse_jumps(run, values, taylor)
     if is_traced(one):
         for _ in range(_repeats(rate)):
-            values, taylor = _advance(run, taylor)
+            values, taylor = advance(run, taylor)
     return values, taylor, good, steps
 
 
@@ -64,123 +80,170 @@ def _repeats(rate: float) -> int:
     return int(np.clip(math.ceil(math.log(1e-9) / math.log(min(max(rate, 1e-12), 0.5))), 2, 20))
 
 
-def _advance(run: Run, taylor: Any) -> tuple[Any, Any]:
-    """One full Newton step from the expansions."""
-    nums = numbers(run.disc, run.problem, taylor)
-    values, _ = run.step(nums)
-    return values, with_held_expansions(run.disc, all_coefficients(run.disc, nums, values))
-
-
-def _iterate(
-    run: Run, values: Any, taylor: Any, one: tuple[Any, Any], shown: Any
-) -> tuple[Any, Any, bool, int, float]:
-    """Damped Newton's method; the length of the next step must not grow (natural monotonicity)."""
-    target = tuple(np.asarray(concrete(x)) for x in one)
-    values = np.asarray(concrete(values))
-    # Lengths are absolute: measured against values that grow, a step that leads away looks shorter.
-    length, steps, rate = _distance(target[0], values), 1, 0.1
-    while length > TOLERANCE * _size(target[0]) and steps < MOST:
-        part = 1.0
-        while True:
-            values_new = values + part * (target[0] - values)
-            taylor_new = taylor + part * (target[1] - taylor)
-            next_target = _tried(run, taylor_new)
-            next_length = np.inf if next_target is None else _distance(next_target[0], values_new)
-            small = TOLERANCE * _size(values_new)
-            if next_length <= max((1.0 - part / 4.0) * length, small) or part <= SHORTEST:
-                break
-            part /= 2.0
-        if next_target is None or not np.isfinite(next_length):
-            break
-        rate = next_length / length if part == 1.0 else rate
-        values, taylor, target, length = values_new, taylor_new, next_target, next_length
-        steps += 1
-        shown.note(f"change {length:.1e}")
-        shown.update()
-    relative = length / _size(target[0])
-    good = bool(relative <= 1e-8)
-    if not good:
-        _refuse_jumps(run, target[0], target[1])
-        run.fail(
-            f"Newton's method did not converge: after {steps} steps the next one would still change u by "
-            f"{relative:.1e} of its size; start nearer (u0), approach the parameters in stages (js.continuation), or "
-            "refine the cloud"
-        )
-    return target[0], target[1], good, steps, rate
-
-
-def _tried(run: Run, taylor: Any) -> tuple[np.ndarray, np.ndarray] | None:
-    """A step, or None where the linearised problem is singular."""
+def _first(run: Run, here: Iterate, free: bool) -> tuple[Iterate, Iterate]:
+    """The start and the first full step; ``free``: another start may be taken where the equation is singular there."""
+    formulation = run.formulation
     try:
-        values, taylor = (np.asarray(concrete(x)) for x in _advance(run, taylor))
-    except SolveError:
-        return None
-    return (values, taylor) if np.isfinite(values).all() else None
+        with raising(run):
+            one = advance(run, here.taylor)
+            _refuse_degenerate(run)
+            return here, one
+    except SolveError as error:
+        other = harmonic(run.disc) if free else None
+        if other is not None:
+            run.formulation = formulation
+            return _first(run, Iterate(*other), False)
+        text = error.args[0]
+        if "singular" in text or NOTHING in text:
+            text = (
+                f"the equation linearised at the start of Newton's method ({'u = 0' if free else 'u0'}) is singular "
+                f"({text.split(';')[0]}); give another start, u0=..., at which the derivative of the pde by u does not "
+                "degenerate (not flat where the slope is a factor), or a condition that is missing"
+            )
+        run.fail(text, error.particles)
+    return here, Iterate(*(np.full(np.shape(x), np.nan) for x in here))
 
 
-def _distance(new: np.ndarray, old: np.ndarray) -> float:
-    return float(np.abs(new - old).max())
+class Found(NamedTuple):
+    """Where a search ended: what its last step led to, how long that was, whether it converged, and who was frozen."""
+
+    at: Iterate
+    change: float
+    good: bool
+    frozen: np.ndarray
 
 
-def _size(values: np.ndarray) -> float:
-    return float(np.abs(values).max(initial=0.0)) or 1.0
+def _refuse_degenerate(run: Run) -> None:
+    """An equation of which nothing is left at a particle leaves its fit free there, and the system regular."""
+    if run.nums is None or is_traced(run.nums.jac):
+        return
+    left = np.abs(np.asarray(run.nums.jac)[:, :, 0]).max(axis=1).min(axis=0)
+    if (left == 0).any():
+        at = np.broadcast_to(run.nums.ids, np.broadcast_shapes(run.nums.ids.shape, left.shape))[left == 0]
+        run.fail(f"{NOTHING} at {len(at)} particle(s), first {some(at)}", at)
 
 
-def _compiled(run: Run, values: Any, taylor: Any) -> tuple[Any, Any, Any, Any]:
+def _searched(record: Record, begin: Iterate, first: Iterate) -> Found:
+    """Damped steps; where they lead nowhere, pseudo-time steps, and in the end full ones."""
+    if not np.isfinite(first.values).all():
+        return Found(first, np.inf, False, np.zeros(0, int))
+    best = _damped(record, begin, first)
+    ways = ["damped steps"]
+    for name, search in (("pseudo-time steps", _in_pseudo_time), ("full steps", _wandering)):
+        if best.good:
+            break
+        ways.append(name)
+        near = search(record, begin, first)
+        step = None if near is None else record.tried(near)
+        if near is not None and step is not None:
+            best = min(best, _damped(record, near, step), key=lambda found: (not found.good, found.change))
+    if not best.good:
+        _refuse_jumps(record.run, *best.at)
+        record.run.fail(
+            f"Newton's method did not converge: {', '.join(ways)} were tried, {record.solves} linear solves, and the "
+            f"next one would still change u by {best.change:.1e} of its size; start nearer (u0), approach the "
+            "parameters in stages (js.continuation), or refine the cloud"
+        )
+    elif record.run.disc.floating:
+        record.run.check_balance(best.at.taylor)
+        best = best._replace(good=not record.run.failed)
+    if len(best.frozen):
+        record.run.object(
+            f"The expansions of {len(best.frozen)} particle(s), first {some(best.frozen)}, do not settle: the solution "
+            "is sharper there than the cloud resolves; refine it."
+        )
+    return best
+
+
+def _damped(record: Record, here: Iterate, target: Iterate) -> Found:
+    """Damped Newton's method; the length of the next step must not grow (natural monotonicity)."""
+    # Lengths are absolute: measured against values that grow, a step that leads away looks shorter.
+    length, part, refused = distance(target, here), 1.0, 0
+    record.changes.append(length / target.size)
+    history, frozen = [(here, target)], Frozen(record.run.disc)
+
+    def found(good: bool = False) -> Found:
+        change = length / target.size
+        return Found(target, change, good or change <= GOOD, frozen.particles)
+
+    for _ in range(MOST):
+        if length <= DONE * target.size:
+            break
+        while True:
+            new = frozen.kept(here.toward(target, part) if len(history) < 2 else mixed(history))
+            after = record.tried(new)
+            next_length = np.inf if after is None else distance(after, new)
+            if after is not None and next_length <= max((1.0 - part / 4.0) * length, DONE * new.size):
+                break
+            if part == 1.0 and _rounded(record.run, length, next_length, target.size):
+                return found(True)
+            if len(history) > 1:
+                history = history[-1:]
+            elif after is not None and length < CLOSE * target.size and frozen.more(here, target):
+                continue
+            elif part <= SHORTEST or refused == REFUSED:
+                return found()
+            else:
+                part, refused = part / 2.0, refused + 1
+        rate = next_length / length
+        record.rate = rate if part == 1.0 else record.rate
+        slow = part == 1.0 and rate > SLOW and next_length < CLOSE * after.size
+        history = [*(history[-DEPTH:] if slow else []), (new, after)]
+        here, target, length, part = new, after, next_length, min(1.0, 2.0 * part)
+        record.went(length, target.size)
+    return found()
+
+
+def _rounded(run: Run, length: float, after: float, size: float) -> bool:
+    """Whether a step no longer falls because round-off, amplified by the matrix, is as large."""
+    if length > ROUND_OFF * size or after > 100.0 * length or run.factor is None:
+        return False
+    return bool(length <= ROUNDING * run.factor.condition() * size)
+
+
+def _in_pseudo_time(record: Record, begin: Iterate, first: Iterate) -> Iterate | None:
+    """Time begins at the start; how large each field is, it and the held values tell, or else the first full step."""
+    held = np.where(record.run.disc.held, first.values, 0.0)
+    known = np.maximum(np.abs(begin.values), np.abs(held)).max(axis=0)
+    scales = np.where(known > 0, known, np.abs(first.values).max(axis=0))
+    scales = np.where(scales > 0, scales, 1.0)
+    near = relaxed(record, begin, scales)
+    return near if near is not None or known.all() else relaxed(record, begin, WARY * scales)
+
+
+def _wandering(record: Record, begin: Iterate, first: Iterate) -> Iterate | None:
+    """Full steps, whatever their length: near singular matrices they are long and lead far, and come back."""
+    here, target = begin, first
+    for _ in range(WANDERING):
+        after = record.tried(target)
+        if after is None:
+            return None
+        here, target = target, after
+        length = distance(target, here)
+        record.went(length, target.size)
+        if length <= NEAR * target.size:
+            return target
+    return None
+
+
+def _compiled(run: Run, here: Iterate) -> tuple[Any, Any, Any, Any]:
     """Undamped Newton's method where no number can be looked at (under jit)."""
 
-    def length(new, old):
-        return jnp.max(jnp.abs(new - old)) / jnp.maximum(jnp.max(jnp.abs(new)), 1e-300)
-
     def more(carry):
-        *_, change, steps = carry
-        return (change > TOLERANCE) & (steps < MOST)
+        _, _, change, before, steps = carry
+        return (change > DONE) & (steps < MOST) & ~_stalled(change, before)
 
     def step(carry):
-        values, taylor, _, steps = carry
-        new, taylor = jax.lax.stop_gradient(_advance(run, taylor))
-        return new, taylor, length(new, values), steps + 1
+        values, taylor, before, _, steps = carry
+        new, taylor = jax.lax.stop_gradient(advance(run, taylor))
+        change = jnp.max(jnp.abs(new - values)) / jnp.maximum(jnp.max(jnp.abs(new)), 1e-300)
+        return new, taylor, change, before, steps + 1
 
-    start = (jnp.asarray(values, float), jnp.asarray(taylor, float), jnp.inf, 0)
-    values, taylor, change, steps = jax.lax.while_loop(more, step, start)
-    return values, taylor, change <= 1e-8, steps
-
-
-def _start(run: Run, u0: Any) -> tuple[Any, Any]:
-    """Values (N, F) and expansions (N, F, K) to start from."""
-    disc = run.disc
-    n, fields = disc.held.shape
-    if u0 is None:
-        values = np.zeros((n, fields))
-    elif callable(u0):
-        points = jax.lax.stop_gradient(disc.cloud.points)
-        values = sample(u0, points, run.problem.params, fields, "u0").T
-    else:
-        values = (u0 if is_traced(u0) else np.asarray(u0, float)).reshape(n, fields)
-    values = jax.lax.stop_gradient(values)
-    if concrete(values) is None or is_traced(disc.stencils.indices):
-        return values, jnp.zeros((n, fields, disc.rec.size)).at[:, :, 0].set(values)
-    given = np.asarray(concrete(values))
-    taylor = np.zeros((n, fields, disc.rec.size))
-    taylor[:, :, 0] = given
-    points = concrete(disc.points)
-    if u0 is not None and points is not None:
-        near = np.asarray(disc.stencils.indices)
-        owners = disc.images.owners(near)
-        _add_slopes(taylor, np.asarray(points), near, owners, disc.rec.dim, disc.rec.order)
-    return given, taylor
+    begin = (jnp.asarray(here.values, float), jnp.asarray(here.taylor, float), jnp.inf, jnp.inf, 0)
+    values, taylor, change, before, steps = jax.lax.while_loop(more, step, begin)
+    return values, taylor, (change <= GOOD) | _stalled(change, before), steps
 
 
-def _add_slopes(
-    taylor: np.ndarray, points: np.ndarray, near: np.ndarray, owners: np.ndarray, dim: int, order: int
-) -> None:
-    """First and second Taylor coefficients of the start, by least squares over the neighbours."""
-    some = [a for a in multi_indices(dim, min(order, 2)) if sum(a)]
-    offset = np.where((near >= 0)[..., None], points[np.maximum(near, 0)] - points[: len(near), None], 0.0)
-    length = np.sqrt((offset**2).sum(axis=2).max(axis=1))
-    scaled = offset / length[:, None, None]
-    p = np.stack([np.prod(scaled ** np.array(a), axis=2) for a in some], axis=2)
-    change = np.where((near >= 0)[..., None], taylor[np.maximum(owners, 0), :, 0] - taylor[:, None, :, 0], 0.0)
-    fitted = np.linalg.pinv(p, rcond=1e-6) @ change  # (N, some, F)
-    powers = length[:, None] ** -np.array([float(sum(a)) for a in some])
-    taylor[:, :, 1 : 1 + len(some)] = np.swapaxes(fitted * powers[:, :, None], 1, 2)
+def _stalled(change: Any, before: Any) -> Any:
+    """Round-off: short steps that no longer fall."""
+    return (change <= STALLED) & (change >= before)

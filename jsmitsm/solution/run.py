@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import jax.numpy as jnp
@@ -40,11 +40,13 @@ class Run:
         self.disc, self.problem = disc, problem
         self.solver, self.throw, self.repair = solver, throw, repair
         self.formulation = formulation
+        self.began = time.perf_counter()
         self.seconds: dict[str, float] = {"local": 0.0, "assembly": 0.0, "solve": 0.0}
         self.messages: list[str] = []
         self.against: list[str] = []  # those of the messages that speak against the solution
         self.failed = False
         self.linear: dict[str, Any] = {}
+        self.changes: list[float] = []  # of Newton's steps, relative to the solution
         self.health: health.Health | None = None
         self.imbalance = np.inf  # of a floating field's data, once solved: the mean residual relative to them
         refuse_too_large(self.disc, self.formulation, self.solver)
@@ -104,21 +106,29 @@ class Run:
         if self.throw:
             raise SolveError(message, [int(i) for i in np.asarray(particles)[:100]])
         self.failed = True
-        self._object(f"FAILED: {message}.")
+        self.object(f"FAILED: {message}.")
 
-    def _object(self, message: str) -> None:
+    def object(self, message: str) -> None:
+        """Note what speaks against the solution."""
         self.messages.append(message)
         self.against.append(message)
 
     def _forget(self) -> None:
         """What an earlier step said speaks of other rows."""
         self.messages, self.against, self.failed = [], [], False
+        self.__dict__.pop("factor", None)
+        self.__dict__.pop("misfit", None)
 
-    def step(self, nums: Numbers) -> tuple[Any, Any]:
-        """Assemble and solve one linear system: values (N, F), and whether it went well."""
+    def step(self, nums: Numbers, altered: Callable[..., Any] | None = None) -> tuple[Any, Any]:
+        """Assemble and solve one linear system: values (N, F), and whether it went well.
+
+        altered: a function of the system's entries, their rows and columns and the right-hand side that returns others.
+        """
         data, r, c, b = self.assembled(nums)
+        if altered is not None:
+            data, r, c, b = altered(data, r, c, b)
         start = time.perf_counter()
-        x, good = self.solved(data, r, c, b)
+        x, good = self.solved(data, r, c, b, balanced=self.disc.linear)
         values = with_held(self.disc, nums, x)
         self.seconds["solve"] += time.perf_counter() - start
         if is_traced(values):
@@ -209,7 +219,7 @@ class Run:
                 system = linsolve.factor(data, r, c, len(b), points, self.solver, self._elliptic)
                 self.imbalance = imbalance(system, x, b, n)
                 if balanced:
-                    self._check_balance()
+                    self.check_balance()
         return x[:n], True
 
     @property
@@ -231,21 +241,30 @@ class Run:
             points = None if points is None else np.concatenate([points, np.full((1, points.shape[1]), np.nan)])
         return data, r, c, b, points
 
-    def _check_balance(self) -> None:
-        """A field without values: its data must balance, up to what the discretisation explains."""
+    def check_balance(self, taylor: Any = None) -> None:
+        """A field without values: its data must balance, up to what the discretisation explains.
+
+        taylor (N, F, K): the expansions about which a nonlinear problem is linearised.
+        """
         self.messages.append("The conditions fix the solution only up to a constant; its mean over the particles is 0.")
-        told, certain = unbalanced(self.imbalance, self._imbalance_at, self.disc.rec.order, self.disc.rec.fields)
+        told, certain = unbalanced(
+            self.imbalance, partial(self._imbalance_at, taylor), self.disc.rec.order, self.disc.rec.fields,
+            self.disc.linear,
+        )  # fmt: skip
         if certain:
             self.fail(told)
         elif told:
-            self._object(told)
+            self.object(told)
 
-    def _imbalance_at(self, order: int) -> float:
+    def _imbalance_at(self, taylor: Any, order: int) -> float:
         """The mean residual, relative to the data, of the same problem with method S of another order."""
         cloud = self.disc.cloud
-        disc = discretize(self.problem, cloud, "S", order, None, None, None)
+        disc = discretize(self.problem, cloud, "S", order, None, None, None, depth=self.disc.rec.depth)
         other = Run(disc, self.problem, self.solver, False, True, "loo")
-        nums = numbers(disc, self.problem)
+        if taylor is not None:
+            more = max(0, disc.rec.size - taylor.shape[2])
+            taylor = np.pad(taylor, ((0, 0), (0, 0), (0, more)))[:, :, : disc.rec.size]
+        nums = numbers(disc, self.problem, taylor)
         classes, rows = other.local_rows(nums)
         other.solved(*matrix(disc, classes, rows), right_side(disc, nums, classes, rows), balanced=False)
         return other.imbalance
@@ -293,6 +312,7 @@ class Run:
         disc = self.disc
         out: dict[str, Any] = {
             "seconds": dict(self.seconds),
+            "depth": disc.rec.depth,
             "particles": len(disc.cloud),
             "unknowns": int((~disc.held).sum()),
             "neighbours": max((c.neighbours.shape[1] for c in disc.classes), default=0),
@@ -301,6 +321,8 @@ class Run:
             "skipped": skipped(disc, self.linear, self.values is None),
             "messages": list(self.messages),
         }
+        if self.changes:
+            out["changes"] = list(self.changes)
         if "residual" in self.linear:
             out["residual"] = self.linear["residual"]
         if self.health is not None:

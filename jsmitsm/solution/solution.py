@@ -81,8 +81,13 @@ class Solution:
 
     @property
     def order(self) -> int:
-        """The degree of the local Taylor polynomials."""
+        """The degree of the local fits."""
         return self._recipe.order
+
+    @property
+    def depth(self) -> int:
+        """Degrees by which the local Taylor polynomials exceed the order."""
+        return self._recipe.depth
 
     @property
     def u(self) -> Array:
@@ -158,7 +163,7 @@ class Solution:
             )
         near, weight = nearest_particles(self.cloud, points, self.cloud.dim + 2 if blend else 1)
         inside = in_domain(self.cloud, points, outside)
-        values = evaluated(b, self.order, self.cloud.points, self._taylor, points, near, weight)
+        values = evaluated(b, self._recipe.reach, self.cloud.points, self._taylor, points, near, weight)
         values = values if inside is None else jnp.where(inside[:, None], values, jnp.nan)
         return values[:, 0] if self._recipe.fields == 1 else values
 
@@ -270,8 +275,9 @@ class Solution:
 
     def __repr__(self) -> str:
         shape = "x".join(map(str, self.u.shape))
+        deep = f", depth={self.depth}" if self.depth else ""
         state = "" if is_traced(self.converged) else f", converged={bool(np.all(self.converged))}"
-        return f"Solution(u: {shape}, method={self.method!r}, order={self.order}{state})"
+        return f"Solution(u: {shape}, method={self.method!r}, order={self.order}{deep}{state})"
 
     def tree_flatten(self):
         return (self._values, self.cloud, self._fit, self._fitted, self.converged, self.iterations), self._recipe

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from typing import Any
 
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.cloud.neighbours import Stencils
@@ -14,7 +15,7 @@ from jsmitsm.particle.kernels import Kernel
 from jsmitsm.runtime.arrays import ValueOrFunction
 from jsmitsm.runtime.progress import bar
 from jsmitsm.runtime.tracers import is_traced
-from jsmitsm.solution.arguments import Formulation, Method, check
+from jsmitsm.solution.arguments import Depth, Formulation, Method, check
 from jsmitsm.solution.fit import Fit, Recipe
 from jsmitsm.solution.newton import newton
 from jsmitsm.solution.run import Run
@@ -28,6 +29,7 @@ def solve(
     *,
     method: Method = "S",
     order: int = 4,
+    depth: Depth = 0,
     kernel: Kernel | None = None,
     stencils: Stencils | None = None,
     basis_terms: int | None = None,
@@ -42,7 +44,11 @@ def solve(
     ----------
     method : "I", "II", "III" (SMITSM, Karamanli 2015), "SSPH", or "S", the recursion with
         symmetric moment rows.
-    order : total degree of the local Taylor expansions.
+    order : total degree of the fit.
+    depth : degrees by which the recursion goes beyond the order: the local polynomials have degree
+        order + depth, with no more free coefficients. 0 is the paper's. "auto" is, for method S, 4 in 1D and 2D (2 at
+        order 2), in 3D 2, or 4 where the operator is constant and of one order; for I, II and III 0. SSPH has no
+        recursion to go deeper with.
     kernel : weights and supports; chosen from the cloud, the order and the method if not given.
     stencils : from :func:`jsmitsm.stencils`; needed where JAX traces ``h``, ``d`` or the points.
     basis_terms : keep only the first so many free coefficients (I, II, III).
@@ -74,22 +80,41 @@ def solve(
     >>> bool(abs(sol.u - (cloud.points[:, 0] ** 5 / 20 + 2 * cloud.points[:, 0] + 1)).max() < 1e-12)
     True
     """
+    run = prepared(
+        problem, cloud, method=method, order=order, kernel=kernel, stencils=stencils, basis_terms=basis_terms,
+        formulation=formulation, solver=solver, u0=u0, throw=throw, depth=depth,
+    )  # fmt: skip
+    if run.disc.linear:
+        values, good = run.step(numbers(run.disc, problem))
+        return finished(run, values, None, good, 1)
+    return finished(run, *newton(run, u0))
+
+
+def prepared(
+    problem: Problem, cloud: Cloud, *, method: str = "S", order: int = 4, kernel: Kernel | None = None,
+    stencils: Stencils | None = None, basis_terms: int | None = None, formulation: str = "auto", solver: str = "auto",
+    u0: Any = None, throw: bool = True, depth: Depth = 0,
+) -> Run:  # fmt: skip
+    """Checked arguments of :func:`solve`, discretised."""
     start = time.perf_counter()
-    check(problem, cloud, method, order, kernel, stencils, formulation, solver, u0, throw)
-    disc = discretize(problem, cloud, method, order, kernel, stencils, basis_terms, sources=False)
+    check(problem, cloud, method, order, kernel, stencils, formulation, solver, u0, throw, depth)
+    disc = discretize(problem, cloud, method, order, kernel, stencils, basis_terms, sources=False, depth=depth)
     problem = disc.problem
     run = Run(disc, problem, solver, throw, kernel is None and stencils is None, formulation)
-    run.seconds["set-up"] = time.perf_counter() - start
+    run.began, run.seconds["set-up"] = start, time.perf_counter() - start
     if not disc.classes:
         raise ValueError("problem: every particle's value is held; nothing is left to solve for")
-    if disc.linear:
-        nums = numbers(disc, problem)
-        values, good = run.step(nums)
-        taylor, iterations = None, 1
-    else:
-        values, taylor, good, iterations = newton(run, u0)
-    run.seconds["total"] = time.perf_counter() - start
-    recipe = Recipe(method, order, basis_terms, run.formulation, problem.fields)
-    fit = Fit(problem, cloud, disc.kernel, table(disc), taylor, recipe)
+    return run
+
+
+def finished(run: Run, values: Any, taylor: Any, good: Any, iterations: Any) -> Solution:
+    """The solution of a run that ended with these values and expansions (None: a linear problem)."""
+    disc, scheme = run.disc, run.disc.scheme
+    run.seconds["total"] = time.perf_counter() - run.began
+    recipe = Recipe(
+        scheme.method, disc.rec.order, disc.basis_terms, run.formulation, disc.rec.fields,
+        disc.rec.depth,
+    )
+    fit = Fit(run.problem, disc.cloud, disc.kernel, table(disc), taylor, recipe)
     report = None if is_traced(values) else run
-    return Solution(values, cloud, recipe, fit, good, iterations, run.stats(), report=report)
+    return Solution(values, disc.cloud, recipe, fit, good, iterations, run.stats(), report=report)

@@ -121,7 +121,8 @@ class Objective:
             wide = kernel.replace(h=reach / np.asarray(kernel.d))
             try:
                 disc = discretize(
-                    self.problem, self.cloud, o["method"], o["order"], wide, self.given, o.get("basis_terms")
+                    self.problem, self.cloud, o["method"], o["order"], wide, self.given, o.get("basis_terms"),
+                    depth=o.get("depth", 0),
                 )
                 break
             except ValueError as error:
@@ -191,7 +192,8 @@ class Objective:
             values, good = run.step(self.numbers)
         else:
             values, taylor, good, iterations = newton(run, self.values)
-        recipe = Recipe(o["method"], o["order"], o.get("basis_terms"), run.formulation, self.problem.fields)
+        recipe = Recipe(o["method"], o["order"], o.get("basis_terms"), run.formulation, self.problem.fields,
+            self.disc.rec.depth)
         fit = Fit(disc.problem, self.cloud, kernel, table(disc), taylor, recipe)
         found = Solution(values, self.cloud, recipe, fit, good, iterations, {})
         return found, *run.seen

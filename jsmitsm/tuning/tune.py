@@ -15,12 +15,14 @@ import jax
 import numpy as np
 
 from jsmitsm.cloud.cloud import Cloud
+from jsmitsm.discretization.supports import default_kernel
 from jsmitsm.equation.problem import Problem
 from jsmitsm.particle.kernels import Kernel
 from jsmitsm.runtime.arrays import ArrayLike, ValueOrFunction
+from jsmitsm.runtime.errors import did_you_mean
 from jsmitsm.runtime.progress import bar
 from jsmitsm.runtime.tracers import is_traced
-from jsmitsm.solution.arguments import SolveOptions, check
+from jsmitsm.solution.arguments import SolveOptions, check, discretized
 from jsmitsm.solution.solution import Solution
 from jsmitsm.solution.solve import solve
 from jsmitsm.tuning.descent import Descent
@@ -69,7 +71,7 @@ class TuneResult:
 def tune(
     problem: Problem,
     cloud: Cloud,
-    kernel: Kernel,
+    kernel: Kernel | None = None,
     *,
     objective: Literal["estimate"] | Callable[[Solution], Any] = "estimate",
     parameters: Parameter | Sequence[Parameter] = ("h", "d"),
@@ -87,7 +89,8 @@ def tune(
 
     Parameters
     ----------
-    kernel : where to start. ``h`` scalar, or (N,) to tune one smoothing length per particle.
+    kernel : where to start. ``h`` scalar, or (N,) to tune one smoothing length per particle. If not given, what
+        :func:`jsmitsm.solve` takes, its smoothing lengths by one factor unless ``groups`` says otherwise.
     objective : "estimate", the distance to a reference solution of higher order that is computed
         once; or a function of a :class:`jsmitsm.Solution` that returns a scalar to be made small.
         Both are held by a bound on the Lebesgue constant: 1.5, or that of h = spacing, d = 4.
@@ -120,9 +123,13 @@ def tune(
     >>> bool(found.history["objective"].min() < found.history["objective"][0] / 2)
     True
     """
-    names = _checked_names(kernel, parameters)
-    _check_input(problem, cloud, kernel, objective, optimizer, steps, solve_options)
     options: dict[str, Any] = {"method": "S", "order": 4, **solve_options}
+    _check_input(problem, cloud, kernel, objective, optimizer, steps, options)
+    if kernel is None:
+        kernel = _chosen(problem, cloud, options)
+        groups = np.zeros(len(cloud), int) if groups is None and "h" in parameters else groups
+    names = _checked_names(kernel, parameters)
+    kernel = kernel.recorded()
     space = ParameterMap(kernel, names, _checked_groups(groups, cloud, names))
     with bar("tune", steps, progress) as shown:
         scored = Objective(problem, cloud, kernel, objective, options)
@@ -132,23 +139,26 @@ def tune(
         if not scored.linear:
             options["u0"] = best.score.values
         solution = solve(problem, cloud, kernel=best.kernel, **options)
-    return TuneResult(best.kernel, solution, search.history(), search.messages, scored.solves + 1)
+    return TuneResult(best.kernel.as_written(), solution, search.history(), search.messages, scored.solves + 1)
 
 
 # ------------------------------------------------------------------ input
 
 
-def _checked_names(kernel: Any, parameters: Any) -> tuple[str, ...]:
-    if not isinstance(kernel, Kernel):
-        raise ValueError(
-            f"kernel: expected a kernel to start from such as js.SuperGaussian(cloud.spacing, 4.0), got {kernel!r}"
-        )
+def _chosen(problem: Problem, cloud: Cloud, options: dict[str, Any]) -> Kernel:
+    """The kernel that :func:`jsmitsm.solve` takes where none is given."""
+    disc = discretized(problem, cloud, options["method"], options["order"], None, options.get("stencils"))
+    return default_kernel(disc.points, np.arange(len(cloud)), disc.stencils.indices)
+
+
+def _checked_names(kernel: Kernel, parameters: Any) -> tuple[str, ...]:
     names = (parameters,) if isinstance(parameters, str) else tuple(parameters)
     known = ["h", "d"] + (["params"] if jax.tree.leaves(kernel.params) else [])
     for name in names:
         if name not in known:
             raise ValueError(
                 f"parameters: {name!r} is no parameter of {type(kernel).__name__}; it has {', '.join(map(repr, known))}"
+                + did_you_mean(name, known)
             )
     if not names or len(set(names)) < len(names):
         raise ValueError(f"parameters: expected some of {', '.join(map(repr, known))}, each once, got {parameters!r}")
@@ -158,13 +168,16 @@ def _checked_names(kernel: Any, parameters: Any) -> tuple[str, ...]:
 def _check_input(problem, cloud, kernel, objective, optimizer, steps, options) -> None:
     for name in options:
         if name not in OPTIONS:
-            raise ValueError(f"{name}: no argument of js.tune or js.solve; those of js.solve are {', '.join(OPTIONS)}")
-    o = {"method": "S", "order": 4, "formulation": "auto", "solver": "auto", "stencils": None, **options}
-    check(problem, cloud, o["method"], o["order"], kernel, o["stencils"], o["formulation"], o["solver"])
+            raise ValueError(f"{name}: no argument of js.tune or js.solve; those of js.solve are {', '.join(OPTIONS)}"
+                             + did_you_mean(name, [*OPTIONS, "objective", "optimizer", "steps"]))  # fmt: skip
+    o = {"formulation": "auto", "solver": "auto", "stencils": None, **options}
+    check(problem, cloud, o["method"], o["order"], kernel, o["stencils"], o["formulation"], o["solver"],
+          depth=o.get("depth", 0))
     if is_traced(kernel, cloud, problem.params):
         raise ValueError("kernel, cloud, problem: traced by a JAX transform; js.tune runs on the host, call it outside")
     if objective != "estimate" and not callable(objective):
-        raise ValueError(f'objective: expected "estimate" or a function of a Solution, got {objective!r}')
+        raise ValueError(f'objective: expected "estimate" or a function of a Solution, got {objective!r}'
+                         + did_you_mean(objective, ["estimate"]))  # fmt: skip
     if optimizer is not None and not (hasattr(optimizer, "init") and hasattr(optimizer, "update")):
         raise ValueError(f"optimizer: expected an optax transformation such as optax.adam(0.1), got {optimizer!r}")
     if isinstance(steps, bool) or not isinstance(steps, (int, np.integer)) or steps < 0:

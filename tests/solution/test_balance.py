@@ -67,3 +67,21 @@ def test_a_factorisation_judges_each_right_side():
         assert sol.converged and sum("its mean" in m for m in sol.stats["messages"]) == 1
     with pytest.raises(js.SolveError, match="do not balance"):
         ready.solve(problem(cloud, 5e-3))
+
+
+def test_a_nonlinear_field_floats_too():
+    """div((1 + |grad u|^2) grad u) = f between given slopes: up to a constant where f balances them, else refused."""
+    known = lambda x: jnp.cos(2 * x[0])
+    flux = lambda u: lambda y: (1 + js.grad(u)(y) @ js.grad(u)(y)) * js.grad(u)(y)
+    slope = js.condition(lambda u, x, n: n @ (js.grad(u)(x) - js.grad(known)(x)))
+    line = js.interval(0.0, 1.0, 31)
+
+    def bent(excess):
+        pde = lambda u, x: js.divergence(flux(u))(x) - (1 + excess) * js.divergence(flux(known))(x)
+        return js.Problem(pde, {"left": slope, "right": slope})
+
+    sol = js.solve(bent(0.0), line)
+    values = np.array(jax.vmap(known)(jnp.asarray(line.points)))
+    assert sol.converged and np.abs(sol.u - values + values.mean()).max() < 1e-4
+    with pytest.raises(js.SolveError, match="do not balance"):
+        js.solve(bent(0.05), line)

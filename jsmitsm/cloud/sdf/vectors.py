@@ -44,7 +44,7 @@ def vector(name: str, value: Any, dim: int | None = None) -> Any:
                 array = jnp.stack([jnp.asarray(v) for v in value])
             else:
                 array = np.asarray(value, dtype=np.float64)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             raise ValueError(f"{name}: expected {dim or 'D'} numbers, got {value!r}") from None
     if array.ndim != 1 or (dim is not None and array.shape != (dim,)) or array.shape[0] not in (1, 2, 3):
         expected = f"({dim},)" if dim else "(D,) with D = 1, 2 or 3"

@@ -1,0 +1,169 @@
+"""The recursion taken deeper than the fit: ``depth`` degrees more, with the same free coefficients."""
+
+import jax
+import jax.numpy as jnp
+import manufactured as mm
+import numpy as np
+import pytest
+
+import jsmitsm as js
+
+SIDES = ("left", "right", "bottom", "top")
+SQUARE = js.rectangle((0, 0), (1, 1), (12, 12), jitter=0.3)
+ROD = js.interval(0.0, 1.0, 21)
+
+
+def wave(x):
+    return jnp.sin(6.0 * x[0] + 0.3) * jnp.cos(5.0 * x[1] - 0.2)
+
+
+def poisson(v, x):
+    return js.laplacian(v)(x)
+
+
+def helmholtz(v, x):
+    return js.laplacian(v)(x) + 30.0 * v(x)  # between the resonances at 2 pi^2 and 5 pi^2
+
+
+def diffusion(v, x):
+    return js.divergence(lambda y: (1.0 + 0.5 * jnp.sin(y[0] + 2.0 * y[1])) * js.grad(v)(y))(x)
+
+
+def quasilinear(v, x):
+    return js.divergence(lambda y: (1.0 + v(y) ** 2) * js.grad(v)(y))(x)
+
+
+def solved(operator, exact, cloud=SQUARE, fields=1, **options):
+    """The solution whose source and values at the boundary are those of ``exact``, and its relative error."""
+    held = {name: js.dirichlet(exact) for name in cloud.groups if name != "interior"}
+    sol = js.solve(js.Problem(lambda u, x: operator(u, x) - operator(exact, x), held, fields=fields), cloud, **options)
+    right = np.asarray(jax.vmap(exact)(cloud.points))
+    return sol, float(np.linalg.norm(sol.u - right) / np.linalg.norm(right))
+
+
+@pytest.mark.parametrize("dim, order, depth", [(1, 3, 4), (2, 3, 4), (2, 4, 1), (3, 2, 2)])
+def test_polynomials_of_the_order_are_reproduced(dim, order, depth):
+    """With a variable coefficient, on a jittered cloud: the tail of a polynomial of the fit's degree is zero."""
+    exact = mm.polynomial(dim, order)
+    operator = lambda v, x: js.divergence(lambda y: (1.5 + y[0]) * js.grad(v)(y))(x)
+    sol, error = solved(operator, exact, mm.jittered(dim, {1: 14, 2: 8, 3: 5}[dim]), order=order, depth=depth)
+    assert error < 1e-10  # round-off of the local systems, amplified by the inverse square of the spacing
+    columns = js.multi_indices(dim, order + depth)
+    assert sol.coefficients.shape == (len(sol.cloud), len(columns))
+    tail = np.array([sum(a) > order for a in columns])
+    assert np.abs(np.asarray(sol.coefficients)[:, tail]).max() < 1e-6
+
+
+@pytest.mark.parametrize(
+    "operator, order, gain",
+    [(poisson, 4, 4), (poisson, 6, 15), (helmholtz, 4, 10), (helmholtz, 5, 10), (diffusion, 4, 10),
+     (quasilinear, 4, 15)],
+)  # fmt: skip
+def test_solutions_that_oscillate_gain(operator, order, gain):
+    """About half of the factors measured on other clouds; values and gradients alike."""
+    shift = 1.5 if operator is quasilinear else 0.0
+    exact = lambda x: wave(x) + shift
+    near = {"u0": exact} if operator is quasilinear else {}  # how Newton's method arrives is another matter
+    errors, slopes = [], []
+    inside = np.random.default_rng(1).uniform(0.1, 0.9, (50, 2))
+    for depth in (0, 4):
+        sol, error = solved(operator, exact, order=order, depth=depth, **near)
+        errors.append(error)
+        slopes.append(np.abs(sol.grad(inside) - jax.vmap(jax.grad(exact))(inside)).max())
+    assert errors[1] * gain < errors[0]
+    assert slopes[1] * gain / 3 < slopes[0]
+
+
+def test_a_solid_gains_in_all_of_its_fields():
+    def solid(v, x):
+        def stress(y):
+            strain = js.grad(v)(y) + js.grad(v)(y).T
+            return strain + 0.75 * jnp.trace(strain) * jnp.eye(2)
+
+        return js.divergence(stress)(x)
+
+    exact = lambda x: jnp.stack([wave(x), jnp.cos(4.0 * x[0] + 1.0) * jnp.sin(3.0 * x[1])])
+    errors = [solved(solid, exact, fields=2, order=6, depth=depth)[1] for depth in (0, 2)]
+    assert errors[1] * 5 < errors[0]
+
+
+@pytest.mark.parametrize("peclet", [5, 100, 1000])
+def test_strong_convection_is_no_worse(peclet):
+    """A tail that met the deep equations exactly would grow as the Peclet number to the power of the depth."""
+    speed = peclet * 11.0  # in spacings of 1/11
+    wind = lambda v, x: js.laplacian(v)(x) - speed * (0.8 * js.grad(v)(x)[0] + 0.6 * js.grad(v)(x)[1])
+    exact = lambda x: jnp.sin(3.0 * x[0] + x[1])
+    flat, deep = (solved(wind, exact, formulation="lsq", depth=depth)[1] for depth in (0, 4))
+    assert deep * 20 < flat
+
+
+def test_the_error_estimate_knows_deep_solutions():
+    for operator in (poisson, helmholtz, diffusion):
+        sol, error = solved(operator, wave, depth=4)
+        right = np.asarray(jax.vmap(wave)(SQUARE.points))
+        estimate = np.linalg.norm(sol.error_estimate()) / np.linalg.norm(right)
+        assert 0.3 < estimate / error < 4
+
+
+@pytest.mark.parametrize("formulation", ["loo", "lsq"])
+def test_gradients_through_a_deep_solve(formulation):
+    """With respect to a coefficient and a source, against differences."""
+
+    def value(a):
+        pde = lambda u, x, a: js.laplacian(u)(x) + a * jnp.exp(x[0]) * u(x) - a**2 * jnp.sin(7.0 * x[0])
+        ends = {"left": js.dirichlet(1.0), "right": js.dirichlet(lambda x, a: a)}
+        sol = js.solve(js.Problem(pde, ends, params=a), ROD, order=4, depth=4, formulation=formulation)
+        return jnp.sum(sol.u**2) + sol(jnp.array([[0.33]]))[0]
+
+    step = 1e-5
+    expected = (value(3.0 + step) - value(3.0 - step)) / (2 * step)
+    assert jax.grad(value)(3.0) == pytest.approx(float(expected), rel=1e-6)
+
+
+def test_the_tail_of_method_iii():
+    """The paper's elimination, and the same tail beyond it."""
+    operator = lambda v, x: js.laplacian(v)(x) + 4.0 * v(x)
+    exact = lambda x: jnp.sin(5.0 * x[0])
+    flat, deep = (solved(operator, exact, ROD, method="III", order=3, depth=depth)[1] for depth in (0, 2))
+    assert deep * 3 < flat
+
+
+def test_nothing_changes_where_nothing_is_asked_for():
+    plain, none = (solved(poisson, wave, **options)[0] for options in ({}, {"depth": 0}))
+    assert np.array_equal(plain.u, none.u) and none.depth == 0 and none.stats["depth"] == 0
+    deep = solved(poisson, wave, depth=2)[0]
+    assert deep.stats["depth"] == deep.depth == 2 and "depth=2" in repr(deep)
+
+
+def test_auto_goes_as_deep_as_pays():
+    harmonic = js.Problem(lambda u, x: js.laplacian(u)(x), {s: js.dirichlet(lambda x: x[0] * x[1]) for s in SIDES})
+    assert js.solve(harmonic, SQUARE, depth="auto").depth == 0  # neither operator nor source says anything there
+    found = [solved(poisson, wave, order=order, depth="auto")[0].depth for order in (2, 3, 4)]
+    assert found == [2, 4, 4]
+    cube = mm.jittered(3, 5)
+    exact = lambda x: jnp.sin(x[0] + x[1] + x[2])
+    assert solved(poisson, exact, cube, order=2, depth="auto")[0].depth == 2
+    assert solved(helmholtz, exact, cube, order=3, depth="auto")[0].depth == 2
+    assert solved(poisson, wave, order=3, method="III", depth="auto")[0].depth == 0
+
+
+@pytest.mark.parametrize(
+    "options, words",
+    [
+        ({"depth": -1}, "depth: expected"), ({"depth": 1.5}, "depth: expected"), ({"depth": "deep"}, "depth: expected"),
+        ({"depth": True}, "depth: expected"), ({"depth": 2, "method": "SSPH"}, "SSPH has no recursion"),
+        ({"depth": 9, "order": 10}, "polynomials of degree 19"),
+    ],
+)  # fmt: skip
+def test_bad_depths_are_refused(options, words):
+    with pytest.raises(ValueError, match=words):
+        solved(poisson, wave, **options)
+
+
+def test_factorize_goes_deep_too():
+    held = {s: js.dirichlet(wave) for s in SIDES}
+    make = lambda k: js.Problem(lambda u, x: js.laplacian(u)(x) - k * js.laplacian(wave)(x), held)
+    ready = js.factorize(make(2.0), SQUARE, depth=4)
+    again = ready.solve(make(1.0))
+    assert again.depth == 4
+    np.testing.assert_allclose(again.u, js.solve(make(1.0), SQUARE, depth=4).u, atol=1e-12)
