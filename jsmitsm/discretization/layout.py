@@ -18,7 +18,8 @@ from jsmitsm.equation.branches import FIELD
 from jsmitsm.equation.closing import closed
 from jsmitsm.equation.conditions import Group, group_conditions
 from jsmitsm.equation.problem import Problem
-from jsmitsm.equation.tracing import Traced, trace
+from jsmitsm.equation.traced import Traced
+from jsmitsm.equation.tracing import trace
 from jsmitsm.particle.elimination import Scheme
 from jsmitsm.particle.kernels import Constant, Kernel
 from jsmitsm.particle.recursion import Recursion, free_indices, recursion

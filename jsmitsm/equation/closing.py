@@ -10,7 +10,8 @@ import jax
 import jax.numpy as jnp
 
 from jsmitsm.equation.problem import Condition, Problem
-from jsmitsm.equation.tracing import Traced, trace
+from jsmitsm.equation.traced import Traced
+from jsmitsm.equation.tracing import trace
 from jsmitsm.runtime.errors import IN_FUNCTIONS, in_words
 from jsmitsm.runtime.tracers import owned
 

@@ -14,7 +14,7 @@ import numpy as np
 from jsmitsm.cloud.cloud import INTERIOR, Cloud
 from jsmitsm.equation.closing import recorded_residual, recorded_values
 from jsmitsm.equation.problem import Condition, Problem
-from jsmitsm.equation.tracing import Traced
+from jsmitsm.equation.traced import Traced
 from jsmitsm.runtime.errors import did_you_mean
 from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.runtime.whole_program import in_one_program, picked

@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from jsmitsm.equation.tracing import Traced
+from jsmitsm.equation.traced import Traced
 from jsmitsm.runtime.arrays import ArrayLike, ValueOrFunction
 from jsmitsm.runtime.errors import did_you_mean, refuse_masked, short
 from jsmitsm.runtime.tracers import is_traced
