@@ -17,7 +17,7 @@ from jsmitsm.runtime.progress import bar
 from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.solution.arguments import Depth, Formulation, Method, check
 from jsmitsm.solution.fit import Fit, Recipe
-from jsmitsm.solution.newton import newton
+from jsmitsm.solution.nonlinear.newton import newton
 from jsmitsm.solution.run import Run
 from jsmitsm.solution.solution import Solution
 

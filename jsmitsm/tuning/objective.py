@@ -27,7 +27,7 @@ from jsmitsm.particle.batches import QUICKLY
 from jsmitsm.particle.kernels import EDGE, Kernel, SuperGaussian
 from jsmitsm.runtime.errors import SolveError
 from jsmitsm.solution.fit import Fit, Recipe
-from jsmitsm.solution.newton import newton
+from jsmitsm.solution.nonlinear.newton import newton
 from jsmitsm.solution.run import Run
 from jsmitsm.solution.solution import Solution
 from jsmitsm.solution.solve import solve

@@ -25,8 +25,8 @@ from jsmitsm.discretization.layout import Discretization
 from jsmitsm.discretization.rows import all_coefficients
 from jsmitsm.runtime.errors import SolveError
 from jsmitsm.runtime.tracers import concrete
+from jsmitsm.solution.nonlinear.start import lengths
 from jsmitsm.solution.run import Run
-from jsmitsm.solution.start import lengths
 from jsmitsm.taylor.multi_indices import multi_indices
 
 # The first step moves no value by more than about this part of the solution; after one that did, or that moved none by
