@@ -38,13 +38,13 @@ if TYPE_CHECKING:
     from jsmitsm.cloud.shapes import from_polygon, from_sdf
     from jsmitsm.runtime.versions import show_versions
     from jsmitsm.show import files, plot
-    from jsmitsm.solution.continuation import continuation
+    from jsmitsm.solution.nonlinear.continuation import continuation
     from jsmitsm.tuning.tune import TuneResult, tune
 else:
     _LAZY = {
         "Quality": "cloud.quality",
         "TuneResult": "tuning.tune",
-        "continuation": "solution.continuation",
+        "continuation": "solution.nonlinear.continuation",
         "files": "show",
         "from_polygon": "cloud.shapes",
         "from_sdf": "cloud.shapes",

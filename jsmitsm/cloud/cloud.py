@@ -10,6 +10,7 @@ import numpy as np
 
 from jsmitsm.runtime.arrays import Array, ArrayLike
 from jsmitsm.runtime.errors import refuse_masked, short, some
+from jsmitsm.runtime.tracers import frozen, owned
 
 INTERIOR = "interior"
 # Coordinates beyond this, or all below its inverse, have powers that are no numbers.
@@ -27,6 +28,11 @@ class Groups(Mapping[str, np.ndarray]):
             index.setflags(write=False)
             self._groups[name] = index
         self._key = tuple((name, index.tobytes()) for name, index in self._groups.items())
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        for index in self._groups.values():
+            index.setflags(write=False)
 
     def __getitem__(self, name: str) -> np.ndarray:
         return self._groups[name]
@@ -66,7 +72,8 @@ class Cloud:
     ValueError
         For a wrong shape, NaN, overlapping or incomplete groups, duplicate particles.
 
-    A cloud is a pytree: points and normals are leaves, groups and cell groups are static.
+    A cloud is a pytree: points and normals are leaves, groups and cell groups are static. It does not change: its
+    arrays are read-only copies, and :meth:`replace` makes another one.
 
     Examples
     --------
@@ -90,6 +97,18 @@ class Cloud:
         self.normals: Array | None = _checked_normals(normals, self.points, self.groups)
         self.cell_groups = _checked_cell_groups(cell_groups, len(self.points))
         self._spacing: float | None = None
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        # What was solved on a cloud rests on it.
+        if name in ("points", "groups", "normals", "cell_groups") and name in self.__dict__:
+            raise AttributeError(f"{name}: a Cloud does not change; take cloud.replace({name}=...) or a new js.Cloud")
+        object.__setattr__(self, name, value)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in self.__dict__.items() if name != "_inside"}  # made again when needed
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update({name: frozen(value) for name, value in state.items()})
 
     @property
     def dim(self) -> int:
@@ -146,7 +165,7 @@ class Cloud:
     @classmethod
     def tree_unflatten(cls, static, leaves):
         new = object.__new__(cls)
-        new.points, new.normals = leaves
+        new.points, new.normals = map(owned, leaves)
         new.groups, new.cell_groups = static
         new._spacing = None
         return new
@@ -189,7 +208,7 @@ def _checked_points(points: Any) -> Any:
             raise ValueError(
                 f"points: {len(same)} duplicate particles, pairs {pairs}; keep one of each (np.unique(points, axis=0))"
             )
-    return points
+    return frozen(points)
 
 
 def _checked_groups(groups: Mapping[str, Any], n: int) -> Groups:
@@ -282,7 +301,7 @@ def _checked_normals(normals: Any, points: Any, groups: Groups) -> Any:
             f"normals: not of unit length at particles {some(bad, most=8)} (length {length[bad[0]]:.3g}); "
             "divide by np.linalg.norm(normals, axis=1, keepdims=True)"
         )
-    return normals
+    return frozen(normals)
 
 
 def _describe_groups(groups: Any) -> str:

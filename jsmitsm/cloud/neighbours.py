@@ -232,7 +232,7 @@ def in_line(
     """In 1D: as many neighbours on either side, ``size`` in all with the particle itself.
 
     The nearest ones would leave a cluster of particles without a link to the others. Where outward ``normals`` face
-    one another the domain has a gap, over which nobody reaches who has enough neighbours on his own side.
+    one another the domain has a gap, over which nobody reaches: -1 stands for what is missing on the own side.
     """
     n = len(points)
     x = points[:, 0]
@@ -245,10 +245,12 @@ def in_line(
     starts = np.concatenate([[0], cuts, [n]])
     part = np.searchsorted(starts, own, side="right")
     low, high = starts[part - 1], starts[part]
-    alone = high - low >= size
-    first = np.clip(own - size // 2, np.where(alone, low, 0), np.where(alone, high, n) - size)
-    index = order[first[:, None] + np.arange(size)].astype(np.int32)
-    return Stencils(_self_first(index, which), np.abs(x[index] - x[order[own]][:, None]).max(axis=1))
+    first = np.clip(own - size // 2, low, np.maximum(low, high - size))
+    place = first[:, None] + np.arange(size)
+    there = place < high[:, None]
+    index = np.where(there, order[np.minimum(place, n - 1)], -1).astype(np.int32)
+    distance = np.where(there, np.abs(x[index] - x[order[own]][:, None]), 0.0)
+    return Stencils(_self_first(index, which), distance.max(axis=1))
 
 
 def within(points: np.ndarray, radius: Any, which: np.ndarray | None = None) -> Stencils:

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jsmitsm.cloud.cloud import Cloud
+from jsmitsm.cloud.domain_quadrature import domain_rule
 from jsmitsm.cloud.triangulation import boundary_facets
 from jsmitsm.taylor.multi_indices import multi_indices
 
@@ -19,9 +20,9 @@ _AROUND = 30
 
 
 class Quadrature(NamedTuple):
-    """sum(weights * f(points)) approximates the integral of f over a boundary group.
+    """sum(weights * f(points)) approximates the integral of f over a boundary group, or over the domain.
 
-    points (Q, D), weights (Q,) in units of length or area (1 in 1D), normals (Q, D), unit and outward.
+    points (Q, D), weights (Q,) in units of length, area or volume (1 at ends in 1D), normals (Q, D), unit and outward.
     """
 
     points: np.ndarray
@@ -32,15 +33,18 @@ class Quadrature(NamedTuple):
         return f"Quadrature({len(self.points)} points, weights that sum to {self.weights.sum():.6g})"
 
 
-def quadrature(cloud: Cloud, group: str) -> Quadrature:
-    """Points and weights for integrals over a boundary group.
+def quadrature(cloud: Cloud, group: str | None = None, degree: int = 8) -> Quadrature:
+    """Points and weights for integrals over a boundary group, or over the domain where no group is named.
+
+    Over the domain: exact for polynomials of the ``degree`` where the boundary is straight, of error
+    O(spacing^(degree + 1)) where it curves smoothly; the normals are NaN. See :mod:`jsmitsm.cloud.domain_quadrature`.
 
     Between neighbouring boundary particles lie cubic facets that follow their normals (curved PN
     triangles, Vlachos et al. 2001, and their counterpart in 2D), flat at corners and where the
     cloud has no normals. A facet belongs to the group whose normals it continues. The
     error is O(spacing^4) on smooth boundaries, none on straight ones.
 
-    Raises ValueError for a group that is no boundary group.
+    Raises ValueError for a group that is no boundary group, and a degree that is no whole number from 1.
 
     Examples
     --------
@@ -48,7 +52,14 @@ def quadrature(cloud: Cloud, group: str) -> Quadrature:
     >>> cloud = js.rectangle((0.0, 0.0), (2.0, 1.0), (9, 5))
     >>> round(float(js.quadrature(cloud, "top").weights.sum()), 12)
     2.0
+    >>> round(float(js.quadrature(cloud).weights.sum()), 12)
+    2.0
     """
+    if isinstance(degree, bool) or not isinstance(degree, (int, np.integer)) or degree < 1:
+        raise ValueError(f"degree: expected a whole number from 1, got {degree!r}")
+    if group is None:
+        at, weights = domain_rule(cloud, int(degree))
+        return Quadrature(at, weights, np.full(at.shape, np.nan))
     if group not in cloud.groups or group == "interior":
         known = ", ".join(repr(name) for name in cloud.groups if name != "interior")
         raise ValueError(f"group: expected a boundary group ({known}), got {group!r}")

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from jsmitsm.cloud.neighbours import nearest
+from jsmitsm.cloud.walls import Walls, nearest_seen
 from jsmitsm.discretization.coefficients import Numbers
 from jsmitsm.discretization.layout import Class, Discretization, rounded_width
 from jsmitsm.discretization.local_data import shared_elimination
@@ -108,7 +108,7 @@ def _repaired(
             break
         # One shape for all attempts: compiling costs far more than computing a few rows twice.
         left = np.resize(left, len(ids))
-        tried = attempt(points, ids[left], size)[:, :width]
+        tried = attempt(points, ids[left], size, disc.walls)[:, :width]
         # And few shapes for all clouds.
         trial = Class(ids[left], _widened(tried, rounded_width(width, 16), 1, -1), scheme)
         best.update(left, trial.neighbours, class_rows(disc, nums, trial, shared))
@@ -207,8 +207,8 @@ def _widened(x: np.ndarray, width: int, axis: int, fill: Any) -> np.ndarray:
 def _wider(factor: float):
     """The nearest neighbours, ``factor`` times as many."""
 
-    def attempt(points: np.ndarray, ids: np.ndarray, size: int) -> np.ndarray:
-        return np.asarray(nearest(points, min(len(points), round(factor * size)), ids).indices)
+    def attempt(points: np.ndarray, ids: np.ndarray, size: int, walls: Walls | None) -> np.ndarray:
+        return np.asarray(nearest_seen(points, min(len(points), round(factor * size)), ids, walls).indices)
 
     return attempt
 
@@ -216,9 +216,9 @@ def _wider(factor: float):
 def _balanced(factor: float):
     """At least a sixteenth of the neighbours from each of eight directions (two in 1D)."""
 
-    def attempt(points: np.ndarray, ids: np.ndarray, size: int) -> np.ndarray:
+    def attempt(points: np.ndarray, ids: np.ndarray, size: int, walls: Walls | None) -> np.ndarray:
         total = min(len(points), round(factor * size))
-        pool = nearest(points, min(len(points), 10 * size), ids).indices
+        pool = nearest_seen(points, min(len(points), 10 * size), ids, walls).indices
         offset = points[np.maximum(pool, 0)] - points[ids][:, None]
         away = np.where(pool >= 0, np.linalg.norm(offset, axis=2), np.inf)
         order = np.argsort(away, axis=1, kind="stable")

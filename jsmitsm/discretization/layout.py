@@ -6,22 +6,26 @@ import inspect
 from dataclasses import dataclass, replace
 from typing import Any
 
+import jax
 import numpy as np
 
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.cloud.neighbours import Stencils
+from jsmitsm.cloud.walls import Walls, seen
 from jsmitsm.discretization.periodic import Images, periodic_images, with_corners
-from jsmitsm.discretization.supports import check_supports, cut_off, default_kernel, find_stencils
+from jsmitsm.discretization.supports import check_supports, cut_off, default_kernel, find_stencils, walls_of
 from jsmitsm.equation.branches import FIELD
+from jsmitsm.equation.closing import closed
 from jsmitsm.equation.conditions import Group, group_conditions
 from jsmitsm.equation.problem import Problem
-from jsmitsm.equation.tracing import Traced, trace
+from jsmitsm.equation.traced import Traced
+from jsmitsm.equation.tracing import trace
 from jsmitsm.particle.elimination import Scheme
 from jsmitsm.particle.kernels import Constant, Kernel
 from jsmitsm.particle.recursion import Recursion, free_indices, recursion
 from jsmitsm.runtime.compiled import at_hand
 from jsmitsm.runtime.errors import IN_FUNCTIONS, in_words
-from jsmitsm.runtime.tracers import concrete, is_traced
+from jsmitsm.runtime.tracers import concrete, is_traced, owned
 
 
 @dataclass
@@ -42,6 +46,7 @@ class Class:
 class Discretization:
     """What is static about a problem on a cloud: decided once, on the host."""
 
+    problem: Problem  # closed: nothing of it is the user's any more
     cloud: Cloud
     kernel: Kernel | None
     stencils: Stencils
@@ -54,6 +59,7 @@ class Discretization:
     partner: np.ndarray  # (N,) the particle whose value each one has: itself but for periodic images
     images: Images
     n_own: np.ndarray  # (N,) own conditions of each particle
+    walls: Walls | None  # what hides particles from one another
     given_stencils: bool  # the user's: nothing outside them is looked at
     basis_terms: int | None = None  # free coefficients kept, all of them if not given
     repeated: int = 0  # particles whose moment system was that of another
@@ -104,6 +110,8 @@ def discretize(
     kernel = kernel and kernel.recorded()
     traced = _traced(problem, cloud.dim)
     _check_operator(traced, problem, order)
+    problem = closed(problem, traced)
+    kernel, stencils = jax.tree.map(owned, (kernel, stencils))
     sourced = sources or not traced.linear or traced.source != "zero"
     rec = recursion(cloud.dim, order, problem.fields, traced.slots, traced.pattern, traced.order)
     flat = traced.constant and rec.scale_free
@@ -139,16 +147,19 @@ def discretize(
         raise ValueError(
             f"kernel: the derivatives of js.Constant vanish, and method {method} tests with them; use another kernel"
         )
-    given_stencils = stencils is not None
+    given_stencils, walls = stencils is not None, walls_of(problem, cloud, images)
     if stencils is None:
-        stencils = find_stencils(cloud, kernel, scheme, images, np.flatnonzero((n_own > 0) & ~held.all(axis=1)))
+        conditioned = np.flatnonzero((n_own > 0) & ~held.all(axis=1))
+        stencils = find_stencils(cloud, kernel, scheme, images, conditioned, walls)
     elif len(stencils) != len(cloud):
         raise ValueError(f"stencils: built for {len(stencils)} particles, the cloud has {len(cloud)}; build them again")
+    elif stencils.radius is not None and not is_traced(stencils):  # those of a former solve were looked at then
+        stencils = seen(stencils, None, walls)
     if kernel is None and method in ("I", "II"):
         kernel = default_kernel(cloud.points, np.arange(len(cloud)), stencils.indices)
     disc = Discretization(
-        cloud, kernel, stencils, traced, rec, groups, scheme, [], held, partner, images, n_own, given_stencils,
-        basis_terms,
+        problem, cloud, kernel, stencils, traced, rec, groups, scheme, [], held, partner, images, n_own, walls,
+        given_stencils,        basis_terms,
     )  # fmt: skip
     if given_stencils or kernel is not None:
         check_supports(scheme, stencils, kernel, disc.points, n_own, disc.active)
@@ -292,6 +303,8 @@ def crowded(group: Group, rec: Recursion) -> bool:
 
 def _traced(problem: Problem, dim: int) -> Traced:
     """The residual recorded; whatever goes wrong in it is said to be the pde's."""
+    if isinstance(problem.pde, Traced):
+        return problem.pde
     expected = "pde(u, x)" if problem.params is None else "pde(u, x, params)"
     try:
         inspect.signature(problem.pde).bind(*([None] * (2 if problem.params is None else 3)))

@@ -7,9 +7,11 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from jsmitsm.cloud.cloud import Cloud
-from jsmitsm.cloud.neighbours import Stencils, evenly_spaced, in_line, jumps, nearest, replaced, within
+from jsmitsm.cloud.cloud import INTERIOR, Cloud
+from jsmitsm.cloud.neighbours import Stencils, evenly_spaced, in_line, jumps, replaced, within
+from jsmitsm.cloud.walls import Walls, nearest_seen, within_seen
 from jsmitsm.discretization.periodic import Images
+from jsmitsm.equation.problem import Problem
 from jsmitsm.particle.elimination import Scheme
 from jsmitsm.particle.kernels import EDGE, Kernel, fitted
 from jsmitsm.particle.recursion import split
@@ -45,8 +47,45 @@ def default_size(scheme: Scheme, even: bool = False) -> int:
     return round(ratio * free) + 2
 
 
+def walls_of(problem: Problem, cloud: Cloud, images: Images) -> Walls | None:
+    """The boundary as what hides particles from one another; None where nothing is known of it."""
+    host, normals = concrete(cloud.points), concrete(cloud.normals)
+    if host is None or (cloud.normals is not None and normals is None):
+        return None
+    points, n = images.searched(np.asarray(host, float)), len(cloud)
+    open_ = {name for cs in problem.bcs.values() for c in cs if c.kind == "periodic" for name in c.groups}
+    wall, interior = np.zeros(n, bool), np.zeros(n, bool)
+    interior[cloud.groups[INTERIOR]] = True
+    for name, ids in cloud.groups.items():
+        wall[ids] = name != INTERIOR and name not in open_
+    given = np.full((n, cloud.dim), np.nan) if normals is None else np.asarray(normals, float)
+    ids = np.flatnonzero(images.extend_values(wall))
+    groups = {name: members[wall[members]] for name, members in cloud.groups.items() if name != INTERIOR}
+    return Walls(points, ids, images.extend_values(given)[ids], images.extend_values(interior), groups)
+
+
 def find_stencils(
-    cloud: Cloud, kernel: Kernel | None, scheme: Scheme, images: Images, conditioned: np.ndarray
+    cloud: Cloud, kernel: Kernel | None, scheme: Scheme, images: Images, conditioned: np.ndarray, walls: Walls | None
+) -> Stencils:
+    """Neighbours that each particle sees, see :mod:`jsmitsm.cloud.walls`; outward normals are checked by the way."""
+    found = _found_stencils(cloud, kernel, scheme, images, conditioned, walls)
+    if walls is not None and cloud.dim == 1:
+        walls.check_outward(np.asarray(found.indices))
+    if walls is not None and kernel is None:
+        counts = (np.asarray(found.indices) >= 0).sum(axis=1)
+        needed = scheme_size(scheme) + 1
+        few = np.flatnonzero(counts < min(needed, counts.max()))
+        if len(few):
+            raise ValueError(
+                f"cloud: {len(few)} particle(s), e.g. particle {few[0]}, see only {counts[few[0]]} of the {needed} "
+                "that a stencil of this order needs, themselves counted: the boundary cuts the others off; add "
+                "particles to that part of the domain, or lower the order"
+            )
+    return found
+
+
+def _found_stencils(
+    cloud: Cloud, kernel: Kernel | None, scheme: Scheme, images: Images, conditioned: np.ndarray, walls: Walls | None
 ) -> Stencils:
     """Neighbours from the kernel's support, or as many of the nearest as the method needs without a kernel.
 
@@ -68,17 +107,17 @@ def find_stencils(
                 "in every stencil; lower the order or add particles"
             )
         if cloud.dim == 1:
-            normals = None if len(images.owner) else concrete(cloud.normals)
+            normals = None if len(images.owner) or walls is None else walls.all_normals()
             return in_line(points, min(default_size(scheme), len(points)), which, normals)
         size = min(default_size(scheme, scheme.method == "S" and evenly_spaced(points)), len(points))
-        found, full = nearest(points, size, which), min(default_size(scheme), len(points))
+        found, full = nearest_seen(points, size, which, walls), min(default_size(scheme), len(points))
         if size == full:
             return found
         wide = jumps(np.asarray(found.radius), images.owners(found.indices))
         if cloud.dim == 3:  # there a Neumann side with small stencils has an error ten times that of the rest
             wide = np.union1d(wide, conditioned)
-        return replaced(found, wide, nearest(points, full, wide)) if len(wide) else found
-    return within(points, np.asarray(kernel.d) * np.asarray(kernel.h), which)
+        return replaced(found, wide, nearest_seen(points, full, wide, walls)) if len(wide) else found
+    return within_seen(points, np.asarray(kernel.d) * np.asarray(kernel.h), which, walls)
 
 
 def default_kernel(points: Any, ids: np.ndarray, near: Any, decay: float = 2.0) -> Kernel:

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jsmitsm.cloud.neighbours import nearest, within
+from jsmitsm.cloud.walls import nearest_seen, within_seen
 from jsmitsm.discretization.coefficients import Numbers
 from jsmitsm.discretization.layout import Class, Discretization
 from jsmitsm.discretization.local_data import around, operands, right_sides, sent
@@ -76,12 +76,13 @@ def _recovery_kernel(disc: Discretization) -> tuple[Kernel, Any]:
         reach = xp.where(xp.isfinite(reach), reach, 0.0)
     else:
         near = None
-        reach = nearest(np.asarray(points), min(count, len(points))).radius
+        reach = nearest_seen(np.asarray(points), min(count, len(points)), None, disc.walls).radius
     xp = jnp if is_traced(reach, kernel) else np
     # Inside the support, and where the weight is not yet lost to rounding.
     wide = kernel.replace(h=xp.maximum(kernel.h, reach / xp.minimum(0.9 * kernel.d, _FAR)))
     if near is None:
-        near = within(np.asarray(points), np.maximum(kernel.h * np.asarray(kernel.d), reach / 0.9)).indices
+        radius = np.maximum(kernel.h * np.asarray(kernel.d), reach / 0.9)
+        near = within_seen(np.asarray(points), radius, None, disc.walls).indices
     return wide, near
 
 

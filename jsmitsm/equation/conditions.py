@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -13,9 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm.cloud.cloud import INTERIOR, Cloud
+from jsmitsm.equation.closing import recorded_residual, recorded_values
 from jsmitsm.equation.problem import Condition, Problem
-from jsmitsm.equation.tracing import Traced, trace
-from jsmitsm.runtime.errors import IN_FUNCTIONS, did_you_mean, in_words
+from jsmitsm.equation.traced import Traced
+from jsmitsm.runtime.errors import did_you_mean
 from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.runtime.whole_program import in_one_program, picked
 from jsmitsm.taylor.multi_indices import Slot
@@ -218,7 +218,7 @@ def _component(problem: Problem, points: Any, value: Any, named: int | None, k: 
     n, several = points.shape[0], problem.fields > 1 and named is None
 
     def compute():
-        if callable(value):
+        if callable(value) or isinstance(value, Traced):
             sampled = sample(value, points, problem.params, problem.fields if several else 1, where)
             return sampled[k if several else 0]
         xp = jnp if is_traced(value) or isinstance(value, jax.Array) else np
@@ -233,14 +233,11 @@ def _component(problem: Problem, points: Any, value: Any, named: int | None, k: 
     return compute
 
 
-def sample(function: Callable[..., Any], points: Any, params: Any, components: int, where: str) -> Any:
-    """A user's function of x at all points: (components, n)."""
-    arguments = "x" if params is None else "x, params"
-    with _named(where, f"a function of {arguments} that returns a scalar"):
-        traced = trace(
-            lambda u, x, *p: _shaped(function(x, *p), components, where), points.shape[1], components, params=params
-        )
-    _, values = traced.coefficients(points, 0, params=params)
+def sample(function: Callable[..., Any] | Traced, points: Any, params: Any, components: int, where: str) -> Any:
+    """A user's function of x, or its record, at all points: (components, n)."""
+    if not isinstance(function, Traced):
+        function = recorded_values(function, points.shape[1], params, components, where)
+    _, values = function.coefficients(points, 0, params=params)
     n = points.shape[0]
     if values is None:
         return np.zeros((components, n))
@@ -249,28 +246,6 @@ def sample(function: Callable[..., Any], points: Any, params: Any, components: i
         bad = int(np.flatnonzero(~np.isfinite(np.asarray(values)).all(axis=0))[0])
         raise ValueError(f"{where}: the function returns NaN or infinity, first at x = {np.asarray(points)[bad]}")
     return values
-
-
-@contextmanager
-def _named(where: str, expected: str) -> Iterator[None]:
-    """Say which of the user's functions failed, and what was expected of it."""
-    try:
-        yield
-    except IN_FUNCTIONS as error:
-        if str(error).startswith(where):
-            raise
-        raise ValueError(f"{where}: expected {expected}; calling it failed: {in_words(error)}") from error
-
-
-def _shaped(result: Any, components: int, where: str) -> Any:
-    if jnp.iscomplexobj(result):
-        raise ValueError(f"{where}: expected real numbers, got complex ones; take jnp.real of them or two fields")
-    result = jnp.asarray(result, float)
-    if result.size == components and result.ndim <= 1:
-        return result.reshape((components,) if components > 1 else ())
-    if result.ndim == 0:
-        return jnp.full((components,), result)
-    raise ValueError(f"{where}: expected a function of one point x (D,) returning a scalar, got shape {result.shape}")
 
 
 def _parts(problem: Problem, points: Any, normals: Any, c: Condition, where: str) -> list[Part]:
@@ -315,9 +290,7 @@ def _as_column(values: Any) -> Any:
 def _general(problem: Problem, points: Any, normals: Any, c: Condition, where: str) -> Part:
     """A user's residual(u, x, n): its derivatives with respect to the slots by AD."""
     dim, n = points.shape[1], points.shape[0]
-    arguments = "u, x, n" if problem.params is None else "u, x, n, params"
-    with _named(where, f"residual({arguments}) returning a scalar or a vector"):
-        traced: Traced = trace(c.residual, dim, problem.fields, extras=((dim,),), params=problem.params)
+    traced = c.residual if isinstance(c.residual, Traced) else recorded_residual(c.residual, dim, problem, where)
     if not traced.slots:
         raise ValueError(f"{where}: the residual does not depend on u; a condition must involve the solution")
 

@@ -15,6 +15,7 @@ from jsmitsm.equation.field import Field, LocalField, field_p, frozen_p
 from jsmitsm.equation.marks import DIFFERENTIATED
 from jsmitsm.runtime.jaxprs import EVERYTHING, bind, called, inner_jaxprs, levels, literal
 from jsmitsm.runtime.snapshot import snapshot
+from jsmitsm.runtime.tracers import owned
 from jsmitsm.taylor.elementwise import ELEMENTWISE
 from jsmitsm.taylor.multi_indices import Slot
 
@@ -340,13 +341,13 @@ def record(
 
     third = jax.make_jaxpr(derivatives)(*map(_shaped, second.jaxpr.invars))
     # The constants of the first trace are the last inputs of the third; make them constants again.
-    n = len(flat.constvars)
-    jaxpr: Any = third.jaxpr
+    n, jaxpr = len(flat.constvars), third.jaxpr
     jaxpr = jaxpr.replace(
         constvars=[*jaxpr.constvars, *jaxpr.invars[len(jaxpr.invars) - n :]],
         invars=jaxpr.invars[: len(jaxpr.invars) - n],
     )
-    return Record(jaxpr, (*third.consts, *first.consts), ordered, tuple(outputs), flat.outvars[0].aval.shape[0], flat)
+    kept = tuple(map(owned, (*third.consts, *first.consts)))  # the user may change the arrays in place
+    return Record(jaxpr, kept, ordered, tuple(outputs), flat.outvars[0].aval.shape[0], flat)
 
 
 def _shaped(v: Any) -> jax.ShapeDtypeStruct:

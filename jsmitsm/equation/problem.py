@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from jsmitsm.equation.traced import Traced
 from jsmitsm.runtime.arrays import ArrayLike, ValueOrFunction
 from jsmitsm.runtime.errors import did_you_mean, refuse_masked, short
 from jsmitsm.runtime.tracers import is_traced
@@ -48,7 +49,9 @@ class Condition:
         def short(v: Any) -> str:
             if isinstance(v, tuple) and len(v) > 6:
                 return f"({v[0]}, {v[1]}, ... {len(v)} in all)"
-            return "<function>" if callable(v) else f"array{v.shape}" if np.ndim(v) and hasattr(v, "shape") else str(v)
+            if callable(v) or isinstance(v, Traced):
+                return "<function>"
+            return f"array{v.shape}" if np.ndim(v) and hasattr(v, "shape") else str(v)
 
         shown = [f"{k}={short(v)}" for k, v in self.parts.items()]
         return f"{self.kind}({', '.join(shown + ([f'field={self.field}'] if self.field is not None else []))})"
@@ -242,13 +245,17 @@ class Problem:
         return Problem(**{**parts, **changes})
 
     def tree_flatten(self):
+        if isinstance(self.pde, Traced):
+            return (self.bcs, self.params, self.pde), (None, self.fields)
         return (self.bcs, self.params), (self.pde, self.fields)
 
     @classmethod
     def tree_unflatten(cls, aux, leaves):
         new = object.__new__(cls)
         new.pde, new.fields = aux
-        new.bcs, new.params = leaves
+        new.bcs, new.params, *recorded = leaves
+        if recorded:
+            (new.pde,) = recorded
         return new
 
     def __repr__(self) -> str:

@@ -39,6 +39,20 @@ def closes_over_traced(function: Any, depth: int = 4) -> bool:
     return False
 
 
+def owned(x: Any) -> Any:
+    """A read-only copy of a numpy array that its owner may change; what nobody can change passes, as all else."""
+    if not isinstance(x, np.ndarray) or (not x.flags.writeable and x.base is None):
+        return x
+    return frozen(np.array(x))
+
+
+def frozen(x: Any) -> Any:
+    """An array of our own, read-only from now on; other things pass."""
+    if isinstance(x, np.ndarray):
+        x.setflags(write=False)
+    return x
+
+
 def concrete(x: Any) -> Any:
     """The numbers behind a value that only carries derivatives; None behind an abstract one."""
     while isinstance(x, jax.core.Tracer):

@@ -119,7 +119,7 @@ def solution(sol: Solution, *, field: int = 0, exact: Any = None, at: Mapping[st
     numbers = drawing.field_of(sol.u, field)
 
     def anywhere(points):
-        return drawing.field_of(sol(points, blend=True), field)
+        return drawing.field_of(sol(points, blend=True, outside="extrapolate"), field)
 
     label = "u" if np.ndim(sol.u) == 1 else f"u[{field}]"
     if sol.cloud.dim > 1:

@@ -34,6 +34,7 @@ class Factorization:
 
     def __init__(self, disc: Discretization, problem: Problem, solver: str, repair: bool, formulation: str):
         self._disc, self._options = disc, (solver, repair, formulation)
+        problem = disc.problem
         self._run = Run(disc, problem, solver, True, repair, formulation)
         self._nums = numbers(disc, problem)
         self._parts: list[Any] = []  # of the least-squares form
@@ -59,6 +60,7 @@ class Factorization:
                 "problem: its operator or the kind of its conditions differs from the one that was factorised; "
                 "call js.factorize again"
             )
+        problem = disc.problem
         nums = numbers(disc, problem)
         same = _same(nums.jac, self._nums.jac) and _same(nums.own, self._nums.own) and _same(nums.data, self._nums.data)
         if not same or disc.scheme.method in ("I", "II"):

@@ -6,13 +6,16 @@ from dataclasses import dataclass
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm.cloud.neighbours import Stencils
 from jsmitsm.discretization.coefficients import numbers
+from jsmitsm.discretization.held_particles import held_particles
 from jsmitsm.discretization.layout import Discretization, discretize, sorted_classes
 from jsmitsm.discretization.rows import all_coefficients
 from jsmitsm.runtime.progress import bar
+from jsmitsm.runtime.tracers import is_traced
 
 
 @dataclass(frozen=True)
@@ -52,11 +55,19 @@ class Fit:
     @bar("fitting")
     def coefficients(self, values: Any) -> Any:
         """Taylor coefficients (N, F, K) of every particle."""
-        disc = self.discretization()
-        disc.classes = sorted_classes(
-            disc, np.flatnonzero(disc.partner == np.arange(len(self.cloud))), disc.stencils
-        )
-        nums = numbers(disc, self.problem, self.taylor, everywhere=True)
+        disc, taylor = self.discretization(), self.taylor
+        held = held_particles(disc)
+        if taylor is not None and len(held):
+            # Those of held particles are continued from others; fitted where that is linearised they are their own.
+            fitted = self._fitted(disc, held, taylor, values)
+            alone = np.isin(disc.partner, held)[:, None, None]
+            taylor = (jnp if is_traced(fitted, taylor) else np).where(alone, fitted, taylor)
+        return self._fitted(disc, np.flatnonzero(disc.partner == np.arange(len(self.cloud))), taylor, values)
+
+    def _fitted(self, disc: Discretization, ids: np.ndarray, taylor: Any, values: Any) -> Any:
+        """Taylor coefficients (N, F, K) of the particles ``ids`` alone, linearised at ``taylor``."""
+        disc.classes = sorted_classes(disc, ids, disc.stencils)
+        nums = numbers(disc, self.problem, taylor, everywhere=True)
         return all_coefficients(disc, nums, values)
 
     def tree_flatten(self):

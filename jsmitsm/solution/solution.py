@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import Any, Protocol
 
 import jax
@@ -12,11 +11,11 @@ import numpy as np
 
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.cloud.quadrature import quadrature
-from jsmitsm.particle.polynomials import derivative_table, monomials
 from jsmitsm.runtime.arrays import Array, ArrayLike, ValueOrFunction
-from jsmitsm.runtime.errors import SolveError, refuse_masked
-from jsmitsm.runtime.tracers import is_traced
+from jsmitsm.runtime.errors import SolveError
+from jsmitsm.runtime.tracers import frozen, is_traced, owned
 from jsmitsm.solution.estimate import error_estimate
+from jsmitsm.solution.evaluation import checked_points, evaluated, in_domain, nearest_particles
 from jsmitsm.solution.fit import Recipe
 from jsmitsm.solution.flags import share
 
@@ -63,7 +62,7 @@ class Solution:
     """
 
     def __init__(self, values, cloud, recipe, fit, converged, iterations, stats, fitted=None, report=None):
-        self._values = values  # (N, F)
+        self._values = frozen(values)  # (N, F)
         self.cloud: Cloud = cloud
         self._recipe: Recipe = recipe
         self._fit = fit  # a pytree with a method .coefficients(values) and friends
@@ -121,35 +120,42 @@ class Solution:
             fitted = self._fit.coefficients(self._values)
             if is_traced(fitted):
                 return fitted
-            self._fitted = fitted
+            self._fitted = frozen(fitted)
         return self._fitted
 
-    def __call__(self, points: ArrayLike, *, blend: bool = False) -> jax.Array:
+    def __call__(self, points: ArrayLike, *, blend: bool = False, outside: str = "nan") -> jax.Array:
         """Values (M,) at ``points`` (M, D), (M, F) for a system.
 
         Each point takes the polynomial of its nearest particle, or with ``blend`` a smooth average
-        of those of its nearest few, which is continuous across the cloud. A point outside of the
-        domain takes the polynomial of the particle nearest to it: an extrapolation, not checked.
+        of those of its nearest few, which is continuous across the cloud.
+
+        outside : what becomes of points outside of the domain and in its holes: "nan", "raise" (ValueError), or
+            "extrapolate", with the polynomial of the particle nearest to them. Points up to half the local spacing
+            outside count as inside. The particles tell what is inside (:mod:`jsmitsm.cloud.inside`); where all of a
+            cloud's points are traced by jax.jit or jax.vmap nothing is known of them, and everything counts as inside.
 
         Raises ValueError for points of another shape, NaN or infinite ones.
         """
-        return self.derivative(points, (0,) * self.cloud.dim, blend=blend)
+        return self.derivative(points, (0,) * self.cloud.dim, blend=blend, outside=outside)
 
-    def grad(self, points: ArrayLike, *, blend: bool = False) -> jax.Array:
-        """Gradients (M, D) at ``points`` (M, D), (M, F, D) for a system; ``blend`` as for values.
+    def grad(self, points: ArrayLike, *, blend: bool = False, outside: str = "nan") -> jax.Array:
+        """Gradients (M, D) at ``points`` (M, D), (M, F, D) for a system; ``blend`` and ``outside`` as for values.
 
         Raises ValueError for points of another shape, NaN or infinite ones.
         """
-        unit = np.eye(self.cloud.dim, dtype=int)
-        return jnp.stack([self.derivative(points, tuple(map(int, b)), blend=blend) for b in unit], axis=-1)
+        unit = [tuple(map(int, b)) for b in np.eye(self.cloud.dim, dtype=int)]
+        return jnp.stack([self.derivative(points, b, blend=blend, outside=outside) for b in unit], axis=-1)
 
-    def derivative(self, points: ArrayLike, multi_index: Sequence[int], *, blend: bool = False) -> jax.Array:
+    def derivative(
+        self, points: ArrayLike, multi_index: Sequence[int], *, blend: bool = False, outside: str = "nan"
+    ) -> jax.Array:
         """The derivative d^b u at ``points`` (M, D), b = ``multi_index``, |b| at most the order: (M,) or (M, F).
 
-        With ``blend`` the polynomials' derivatives are averaged. Raises ValueError for wrong points or orders.
+        With ``blend`` the polynomials' derivatives are averaged; ``outside`` as for values. Raises ValueError for
+        wrong points or orders.
         """
         self.refuse_stacked()
-        points = _checked_points(points, self.cloud.dim)
+        points = checked_points(points, self.cloud.dim)
         whole = isinstance(multi_index, (tuple, list)) and all(isinstance(v, (int, np.integer)) for v in multi_index)
         b = tuple(map(int, multi_index)) if whole else ()
         if len(b) != self.cloud.dim or min(b) < 0 or sum(b) > self.order:
@@ -157,18 +163,28 @@ class Solution:
                 f"multi_index: expected {self.cloud.dim} non-negative orders with a sum of at most {self.order}, "
                 f"got {multi_index!r}"
             )
-        near, weight = _nearest(self.cloud.points, points, self.cloud.dim + 2 if blend else 1)
-        values = _evaluate(b, self._recipe.reach, self.cloud.points, self._taylor, points, near, weight)
+        near, weight = nearest_particles(self.cloud, points, self.cloud.dim + 2 if blend else 1)
+        inside = in_domain(self.cloud, points, outside)
+        values = evaluated(b, self._recipe.reach, self.cloud.points, self._taylor, points, near, weight)
+        values = values if inside is None else jnp.where(inside[:, None], values, jnp.nan)
         return values[:, 0] if self._recipe.fields == 1 else values
 
-    def integral(self, group: str) -> jax.Array:
-        """The integral of u over a boundary group, a scalar or (F,); see :func:`jsmitsm.quadrature`.
+    def integral(self, group: str | None = None) -> jax.Array:
+        """The integral of u over a boundary group, or without a name over the domain: a scalar or (F,).
 
+        That over the domain has the order of the solution, on curved domains too; see :func:`jsmitsm.quadrature`.
         Raises ValueError for a group that is no boundary group.
+
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import jsmitsm as js
+        >>> ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(1.0)}
+        >>> sol = js.solve(js.Problem(lambda u, x: js.laplacian(u)(x) - 2.0, ends), js.interval(0.0, 1.0, 9))
+        >>> round(float(sol.integral()), 12)  # of x^2
+        0.333333333333
         """
         self.refuse_stacked()
-        points, weights, _ = quadrature(self.cloud, group)
-        return jnp.tensordot(weights, self(points), axes=1)
+        points, weights, _ = quadrature(self.cloud, group, self.order)
+        return jnp.tensordot(weights, self(points, outside="extrapolate"), axes=1)
 
     def flux(self, group: str, conductivity: ValueOrFunction = 1.0) -> jax.Array:
         """The integral of conductivity n . grad u over a boundary group, n outward: a scalar or (F,).
@@ -183,7 +199,7 @@ class Solution:
             conductivity = jax.vmap(conductivity)(points)
         elif not is_traced(conductivity) and np.asarray(conductivity).dtype.kind not in "iuf":
             raise ValueError(f"conductivity: expected a number or a function of one point x, got {conductivity!r}")
-        slope = jnp.einsum("q...d,qd->q...", self.grad(points), normals)
+        slope = jnp.einsum("q...d,qd->q...", self.grad(points, outside="extrapolate"), normals)
         return jnp.tensordot(weights * conductivity, slope, axes=1)
 
     def error_estimate(self) -> Array:
@@ -193,15 +209,15 @@ class Solution:
         Raises ValueError for a solution that was pickled, and where the points are traced.
         """
         self.refuse_stacked()
+        if self._error is not None:
+            return self._error
         if self._fit is None:
             raise ValueError("error_estimate: this solution was pickled without its problem; ask before pickling")
-        if self._error is None:
-            error = error_estimate(self._fit, self._values)
-            if is_traced(error, self._values):
-                return error
-            self._error = np.asarray(error)
-            self._share = share(self._error.reshape(np.shape(self._values)), np.asarray(self._values))
-        return self._error.copy()
+        error = error_estimate(self._fit, self._values)
+        if not is_traced(error, self._values):
+            self._error = frozen(error)
+            self._share = share(np.reshape(error, np.shape(self._values)), np.asarray(self._values))
+        return error
 
     def _estimated(self) -> float:
         """The estimated error over the solution, infinite where there is none."""
@@ -276,64 +292,16 @@ class Solution:
     def tree_unflatten(cls, recipe, leaves):
         new = object.__new__(cls)
         new._values, new.cloud, new._fit, new._fitted, new.converged, new.iterations = leaves
+        new._values, new._fitted = owned(new._values), owned(new._fitted)
         new._recipe = recipe
         new.stats = {}
         new._report, new._found, new._error, new._share, new._untold = None, None, None, 0.0, ""
         return new
 
     def __getstate__(self):
-        # The user's functions need not pickle: what they give, the local polynomials, does.
+        # Records need not pickle: what they give, the local polynomials, does.
         fitted = jax.tree.map(np.asarray, self._taylor)
         return {**self.__dict__, "_fit": None, "_fitted": fitted, "_found": self.flags, "_report": None}
 
-
-def _checked_points(points: Any, dim: int) -> Any:
-    if not is_traced(points):
-        refuse_masked(points, "points")
-        try:
-            if np.iscomplexobj(points):
-                raise TypeError
-            points = np.asarray(points, dtype=float)
-        except (TypeError, ValueError, OverflowError):
-            raise ValueError(
-                f"points: expected real numbers of shape (M, {dim}), got {type(points).__name__}"
-            ) from None
-        if points.ndim == 2 and not np.isfinite(points).all():
-            raise ValueError("points: NaN or infinite coordinates; evaluate at finite points")
-    if points.ndim != 2 or points.shape[1] != dim:
-        raise ValueError(f"points: expected shape (M, {dim}), got {points.shape}; one point is points[None, :]")
-    return points
-
-
-def _nearest(centres: Any, points: Any, count: int) -> tuple[Any, Any]:
-    """The nearest particles (M, count) of each point and their weights, which sum to one."""
-    count = min(count, centres.shape[0])
-    if is_traced(centres, points):
-        square = jnp.sum((jax.lax.stop_gradient(points)[:, None] - jax.lax.stop_gradient(centres)[None]) ** 2, axis=2)
-        index = jax.lax.top_k(-square, count)[1]
-    else:
-        from scipy.spatial import cKDTree
-
-        index = cKDTree(np.asarray(centres)).query(points, k=range(1, count + 1))[1]
-    if count == 1:
-        return index, np.ones(index.shape)
-    xp = jnp if is_traced(centres, points) else np
-    square = xp.sum((points[:, None] - xp.asarray(centres)[index]) ** 2, axis=2)
-    # At a particle the root has no slope; it is taken as zero there.
-    distance = xp.where(square > 0, xp.sqrt(xp.where(square > 0, square, 1.0)), 0.0)
-    # The farthest of them gets weight zero, so that none enters or leaves with a jump.
-    weight = xp.maximum(1.0 - distance / distance.max(axis=1, keepdims=True), 0.0) ** 2
-    weight = weight + 1e-12  # where all are equally far; its square is a number in float32 too
-    return index, weight / weight.sum(axis=1, keepdims=True)
-
-
-@partial(jax.jit, static_argnums=(0, 1))
-def _evaluate(b, order, centres, taylor, points, near, weight):
-    """sum_k weight[k] d^b p_k(x): (M, F)."""
-    dim = points.shape[1]
-    lower, factor = derivative_table(dim, order, b)
-    total = 0.0
-    for k in range(near.shape[1]):
-        p = monomials(points - centres[near[:, k]], order)[:, lower] * factor
-        total = total + weight[:, k, None] * jnp.einsum("mfk,mk->mf", taylor[near[:, k]], p)
-    return total
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update({name: frozen(value) for name, value in state.items()})

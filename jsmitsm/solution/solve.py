@@ -17,7 +17,7 @@ from jsmitsm.runtime.progress import bar
 from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.solution.arguments import Depth, Formulation, Method, check
 from jsmitsm.solution.fit import Fit, Recipe
-from jsmitsm.solution.newton import newton
+from jsmitsm.solution.nonlinear.newton import newton
 from jsmitsm.solution.run import Run
 from jsmitsm.solution.solution import Solution
 
@@ -99,6 +99,7 @@ def prepared(
     start = time.perf_counter()
     check(problem, cloud, method, order, kernel, stencils, formulation, solver, u0, throw, depth)
     disc = discretize(problem, cloud, method, order, kernel, stencils, basis_terms, sources=False, depth=depth)
+    problem = disc.problem
     run = Run(disc, problem, solver, throw, kernel is None and stencils is None, formulation)
     run.began, run.seconds["set-up"] = start, time.perf_counter() - start
     if not disc.classes:

@@ -27,7 +27,7 @@ from jsmitsm.particle.batches import QUICKLY
 from jsmitsm.particle.kernels import EDGE, Kernel, SuperGaussian
 from jsmitsm.runtime.errors import SolveError
 from jsmitsm.solution.fit import Fit, Recipe
-from jsmitsm.solution.newton import newton
+from jsmitsm.solution.nonlinear.newton import newton
 from jsmitsm.solution.run import Run
 from jsmitsm.solution.solution import Solution
 from jsmitsm.solution.solve import solve
@@ -194,7 +194,7 @@ class Objective:
             values, taylor, good, iterations = newton(run, self.values)
         recipe = Recipe(o["method"], o["order"], o.get("basis_terms"), run.formulation, self.problem.fields,
             self.disc.rec.depth)
-        fit = Fit(self.problem, self.cloud, kernel, table(disc), taylor, recipe)
+        fit = Fit(disc.problem, self.cloud, kernel, table(disc), taylor, recipe)
         found = Solution(values, self.cloud, recipe, fit, good, iterations, {})
         return found, *run.seen
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import jsmitsm.equation.tracing as trace_module
+import jsmitsm.equation.traced as trace_module
 from jsmitsm.equation.field import local_field
 from jsmitsm.equation.operators import divergence, grad, hessian, laplacian, partial
 from jsmitsm.equation.tracing import trace

@@ -22,7 +22,7 @@ js.tune(problem, cloud, kernel, method="Q")  # wrong: arg-type, reportArgumentTy
 js.tune(problem, cloud, kernel, parameters=("h", "D"))  # wrong: arg-type, reportArgumentType
 js.tune(problem, cloud, kernel, objective="estimated")  # wrong: arg-type, reportArgumentType
 js.tune(problem, cloud, kernel, step=5)  # wrong: call-arg, reportCallIssue
-js.continuation(lambda c: problem, cloud, [0.0, 1.0], solver="Q")  # wrong: arg-type, reportArgumentType
+js.continuation(lambda c: problem, cloud, [0.0, 1.0], solver="Q")  # wrong: call-overload, reportArgumentType
 
 values: str = sol.u  # wrong: assignment, reportAssignmentType
 anywhere: int = sol([[0.5]])  # wrong: assignment, reportAssignmentType

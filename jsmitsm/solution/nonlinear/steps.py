@@ -20,12 +20,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jsmitsm.discretization.coefficients import numbers
+from jsmitsm.discretization.held_particles import with_held_expansions
 from jsmitsm.discretization.layout import Discretization
 from jsmitsm.discretization.rows import all_coefficients
 from jsmitsm.runtime.errors import SolveError
 from jsmitsm.runtime.tracers import concrete
+from jsmitsm.solution.nonlinear.start import lengths
 from jsmitsm.solution.run import Run
-from jsmitsm.solution.start import lengths
 from jsmitsm.taylor.multi_indices import multi_indices
 
 # The first step moves no value by more than about this part of the solution; after one that did, or that moved none by
@@ -106,7 +107,7 @@ def advance(run: Run, taylor: Any, altered: Callable[..., Any] | None = None) ->
     """One full step from the expansions; ``altered`` may change the linear system (see :meth:`Run.step`)."""
     nums = numbers(run.disc, run.problem, taylor)
     values, _ = run.step(nums, altered)
-    return Iterate(values, all_coefficients(run.disc, nums, values))
+    return Iterate(values, with_held_expansions(run.disc, all_coefficients(run.disc, nums, values)))
 
 
 @dataclass

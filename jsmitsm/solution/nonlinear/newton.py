@@ -20,9 +20,9 @@ from jsmitsm.equation.branches import FIELD
 from jsmitsm.runtime.errors import SolveError, some
 from jsmitsm.runtime.progress import bar
 from jsmitsm.runtime.tracers import concrete, is_traced
+from jsmitsm.solution.nonlinear.start import harmonic, start
+from jsmitsm.solution.nonlinear.steps import Frozen, Iterate, Record, advance, distance, mixed, raising, relaxed
 from jsmitsm.solution.run import Run
-from jsmitsm.solution.start import harmonic, start
-from jsmitsm.solution.steps import Frozen, Iterate, Record, advance, distance, mixed, raising, relaxed
 
 # Steps of one search. A step shorter than DONE of the solution is the last; shorter than GOOD it counts as converged.
 MOST, DONE, GOOD = 50, 1e-10, 1e-8

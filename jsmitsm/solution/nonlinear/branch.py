@@ -21,10 +21,10 @@ import numpy as np
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.equation.problem import Problem
 from jsmitsm.runtime.errors import SolveError
+from jsmitsm.solution.nonlinear.steps import Iterate, advance, distance
 from jsmitsm.solution.run import Run
 from jsmitsm.solution.solution import Solution
 from jsmitsm.solution.solve import finished, prepared, solve
-from jsmitsm.solution.steps import Iterate, advance, distance
 
 # The change of the parameter by which the tangent is measured, relative to the distance of the first two.
 NUDGE = 1e-6

@@ -14,7 +14,7 @@ from jsmitsm.runtime.arrays import Array, ValueOrFunction
 from jsmitsm.runtime.errors import SolveError
 from jsmitsm.runtime.progress import bar
 from jsmitsm.solution.arguments import SolveOptions
-from jsmitsm.solution.branch import Branch, follow
+from jsmitsm.solution.nonlinear.branch import Branch, follow
 from jsmitsm.solution.solution import Solution
 from jsmitsm.solution.solve import solve
 

@@ -1,0 +1,81 @@
+"""A problem closed: the user's functions recorded and the arrays copied, so that nothing can change it any more."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from jsmitsm.equation.problem import Condition, Problem
+from jsmitsm.equation.traced import Traced
+from jsmitsm.equation.tracing import trace
+from jsmitsm.runtime.errors import IN_FUNCTIONS, in_words
+from jsmitsm.runtime.tracers import owned
+
+
+def closed(problem: Problem, traced: Traced) -> Problem:
+    """The problem as it is now: its functions recorded (``traced`` is its pde's record), its arrays copied.
+
+    What is made of it later, derivatives and estimates, is that of this problem, whatever the user's closures,
+    parameters and arrays have become.
+    """
+    if problem.pde is traced:
+        return problem
+    new = object.__new__(Problem)
+    new.fields, new.params = problem.fields, jax.tree.map(owned, problem.params)
+    new.pde = traced  # type: ignore[assignment]
+    new.bcs = {
+        name: [_closed_condition(problem, c, traced.dim, f"bcs[{name!r}]") for c in conditions]
+        for name, conditions in problem.bcs.items()
+    }
+    return new
+
+
+def _closed_condition(problem: Problem, c: Condition, dim: int, where: str) -> Condition:
+    components = problem.fields if c.field is None else 1
+
+    def one(name: str, part: Any) -> Any:
+        if not callable(part):
+            return owned(part)
+        if c.kind == "condition":
+            return recorded_residual(part, dim, problem, where)
+        return recorded_values(part, dim, problem.params, components, f"{where}.{name}")
+
+    return Condition(c.kind, c.field, **{name: one(name, part) for name, part in c.parts.items()})
+
+
+def recorded_values(function: Callable[..., Any], dim: int, params: Any, components: int, where: str) -> Traced:
+    arguments = "x" if params is None else "x, params"
+    with _named(where, f"a function of {arguments} that returns a scalar"):
+        return trace(lambda u, x, *p: _shaped(function(x, *p), components, where), dim, components, params=params)
+
+
+def recorded_residual(residual: Callable[..., Any], dim: int, problem: Problem, where: str) -> Traced:
+    arguments = "u, x, n" if problem.params is None else "u, x, n, params"
+    with _named(where, f"residual({arguments}) returning a scalar or a vector"):
+        return trace(residual, dim, problem.fields, extras=((dim,),), params=problem.params)
+
+
+@contextmanager
+def _named(where: str, expected: str) -> Iterator[None]:
+    """Say which of the user's functions failed, and what was expected of it."""
+    try:
+        yield
+    except IN_FUNCTIONS as error:
+        if str(error).startswith(where):
+            raise
+        raise ValueError(f"{where}: expected {expected}; calling it failed: {in_words(error)}") from error
+
+
+def _shaped(result: Any, components: int, where: str) -> Any:
+    if jnp.iscomplexobj(result):
+        raise ValueError(f"{where}: expected real numbers, got complex ones; take jnp.real of them or two fields")
+    result = jnp.asarray(result, float)
+    if result.size == components and result.ndim <= 1:
+        return result.reshape((components,) if components > 1 else ())
+    if result.ndim == 0:
+        return jnp.full((components,), result)
+    raise ValueError(f"{where}: expected a function of one point x (D,) returning a scalar, got shape {result.shape}")
