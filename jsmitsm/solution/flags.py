@@ -15,13 +15,13 @@ from typing import Any
 
 import numpy as np
 
-from jsmitsm.discretization.between import between
 from jsmitsm.discretization.health import LEBESGUE
 from jsmitsm.discretization.leave_one_out import right_side
 from jsmitsm.discretization.operator_kind import cell_peclet, mean_spacing, usual_condition, wave_number
 from jsmitsm.discretization.rows import all_rows
 from jsmitsm.discretization.steepness import steepness, unseen
 from jsmitsm.runtime.errors import some
+from jsmitsm.solution.between import between
 
 # A particle may differ from the linear function through its neighbours by this part of the
 # range; a sine of six particles a wavelength differs by 0.25. By order: up to 3, and above.
