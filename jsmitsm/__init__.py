@@ -18,7 +18,7 @@ from jsmitsm.solution.solution import Solution
 from jsmitsm.solution.solve import solve
 from jsmitsm.taylor.multi_indices import multi_indices
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 __all__ = [
     "Cloud", "Condition", "Constant", "CubicSpline", "Factorization", "Formulation", "Gaussian", "Kernel", "Method",
