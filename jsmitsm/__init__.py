@@ -8,14 +8,9 @@ from jsmitsm.cloud.neighbours import Stencils, stencils
 from jsmitsm.equation.marks import meant
 from jsmitsm.equation.operators import divergence, grad, hessian, laplacian, partial
 from jsmitsm.equation.problem import Condition, Problem, condition, dirichlet, fix, free, neumann, periodic, robin
-from jsmitsm.linear.linsolve import Solver
 from jsmitsm.particle.kernels import Constant, CubicSpline, Gaussian, Kernel, SuperGaussian, Wendland
 from jsmitsm.runtime.errors import SolveError, did_you_mean
 from jsmitsm.runtime.progress import no_progress
-from jsmitsm.solution.arguments import Formulation, Method
-from jsmitsm.solution.factorization import Factorization, factorize
-from jsmitsm.solution.solution import Solution
-from jsmitsm.solution.solve import solve
 from jsmitsm.taylor.multi_indices import multi_indices
 
 __version__ = "0.2.0"
@@ -29,22 +24,33 @@ __all__ = [
     "stencils", "tune",
 ]  # fmt: skip
 
-# Imported when first used: they need more than solving does. Where each stands is said twice, to type checkers and to
-# Python: with a module's __getattr__ in sight a checker would believe in every name.
+# Imported when first used, the solver too: who draws or makes clouds need not wait for it. Where each stands is said
+# twice, to type checkers and to Python: with a module's __getattr__ in sight a checker would believe in every name.
 if TYPE_CHECKING:
     from jsmitsm.cloud import sdf
     from jsmitsm.cloud.quadrature import quadrature
     from jsmitsm.cloud.quality import Quality, quality
     from jsmitsm.cloud.shapes import from_polygon, from_sdf
+    from jsmitsm.linear.linsolve import Solver
     from jsmitsm.runtime.versions import show_versions
     from jsmitsm.show import files, plot
+    from jsmitsm.solution.arguments import Formulation, Method
+    from jsmitsm.solution.factorization import Factorization, factorize
     from jsmitsm.solution.nonlinear.continuation import continuation
+    from jsmitsm.solution.solution import Solution
+    from jsmitsm.solution.solve import solve
     from jsmitsm.tuning.tune import TuneResult, tune
 else:
     _LAZY = {
+        "Factorization": "solution.factorization",
+        "Formulation": "solution.arguments",
+        "Method": "solution.arguments",
         "Quality": "cloud.quality",
+        "Solution": "solution.solution",
+        "Solver": "linear.linsolve",
         "TuneResult": "tuning.tune",
         "continuation": "solution.nonlinear.continuation",
+        "factorize": "solution.factorization",
         "files": "show",
         "from_polygon": "cloud.shapes",
         "from_sdf": "cloud.shapes",
@@ -53,6 +59,7 @@ else:
         "quality": "cloud.quality",
         "sdf": "cloud",
         "show_versions": "runtime.versions",
+        "solve": "solution.solve",
         "tune": "tuning.tune",
     }
     _MODULES = ("files", "plot", "sdf")
@@ -61,7 +68,8 @@ else:
         if name in _MODULES:
             return import_module(f"jsmitsm.{_LAZY[name]}.{name}")
         if name in _LAZY:
-            return getattr(import_module(f"jsmitsm.{_LAZY[name]}"), name)
+            found = globals()[name] = getattr(import_module(f"jsmitsm.{_LAZY[name]}"), name)
+            return found
         known = "" if name.startswith("_") else did_you_mean(name, __all__)
         raise AttributeError(f"module 'jsmitsm' has no attribute {name!r}{known}")
 

@@ -161,7 +161,7 @@ class Pull:
         self.strength = self.residual = 0.0
 
     def __call__(self, data: Any, r: Any, c: Any, b: Any) -> tuple[Any, Any, Any, Any]:
-        data, b = np.asarray(data), np.asarray(b)
+        data, b = np.asarray(concrete(data)), np.asarray(concrete(b))  # the search is not differentiated
         n, own = len(b), r == c
         diagonal = np.bincount(r[own], data[own], n)
         diagonal[diagonal == 0] = np.abs(diagonal).max() or 1.0
