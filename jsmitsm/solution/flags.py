@@ -31,6 +31,8 @@ ROUGH = (0.2, 0.3)
 SINGULAR = {"loo": 1e3, "lsq": 1e2}
 # The part of the solution that hangs on what the cloud does not resolve of the source.
 SOURCE = 0.3
+# Where it makes more than the solution itself, a nearly singular operator leaves nothing to estimate.
+OVERWHELMING = 1.0
 # Weights that sum to this amplify any roughness of the neighbours; a share of FEW does no harm.
 WEAK, FEW = 10.0, 0.01
 # Least squares: misfit of the local fits, added up across the domain, in parts of the range.
@@ -83,7 +85,10 @@ def flags(run: Any, values: Any, nums: Any, estimated: Callable[[], float]) -> t
     for test in (_condition, _misfit, _waves, _roughness, _source, _coefficients, _weakness, _peclet):
         test(run, values, nums, doubts, found)
     most = MISFIT if found["peclet"] > CARRIED else HOPELESS_MISFIT
-    if certain or found.get("misfit", 0.0) > most or found.get("excess", 0.0) > BLIND:
+    singular = found.get("excess", 0.0) > SINGULAR[run.formulation]
+    # Near a resonance the last digits of the source decide, and the estimate passes through the same inverse.
+    resonant = singular and found.get("source", 0.0) > OVERWHELMING
+    if certain or resonant or found.get("misfit", 0.0) > most or found.get("excess", 0.0) > BLIND:
         return doubts + certain, found
     if len(run.disc.cloud) > MANY or _cleared(run, found, doubts):
         return doubts + certain, found
@@ -92,7 +97,7 @@ def flags(run: Any, values: Any, nums: Any, estimated: Callable[[], float]) -> t
         return doubts, found
     found["missed"] = missed = share(between(run.disc, nums, run.problem, values, run.rows, run.factor), values)
     # Near a resonance any residual grows without bound, that of the truncation too; the estimate has its signs.
-    if missed <= MISSED or found.get("excess", 0.0) > SINGULAR[run.formulation]:
+    if missed <= MISSED or singular:
         return [], found
     return [
         f"Between the particles the equation is missed by as much as makes {missed:.0%} of the solution: the source or "
