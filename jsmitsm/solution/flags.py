@@ -53,7 +53,7 @@ PHASE = (0.9, 3.5)
 
 
 # An estimated error below this part of the solution clears what only suspects the resolution ...
-CLEARED = 0.03
+CLEARED = 0.02
 # ... unless what is missed between the particles would make so much of the solution.
 MISSED = 1.0
 # Measures below these clear a solution without an estimate. Of 250 random linear problems these cleared 53, all of them

@@ -20,7 +20,7 @@ from jsmitsm.solution.fit import Recipe
 from jsmitsm.solution.flags import share
 
 # An estimated error above this part of the solution is a flag.
-LARGE = 0.05
+LARGE = 0.02
 
 
 class Report(Protocol):
@@ -234,8 +234,8 @@ class Solution:
 
         Tested when first asked for: roughness between neighbours, near singularity, an unresolved
         source or coefficient, hopeless stencils, misfits of the equation. Linear problems of one field that pass
-        by far are cleared. For all others, of up to 200,000 particles, the error is estimated: below 3 % clears what
-        is only suspected, above 5 % is a flag. No flag is no proof.
+        by far are cleared. For all others, of up to 200,000 particles, the error is estimated: below 2 % clears what
+        is only suspected, above is a flag. No flag is no proof.
         """
         self.refuse_stacked()
         if self._found is None and self._report is not None:
