@@ -16,8 +16,7 @@ import numpy as np
 
 from jsmitsm.discretization.layout import Discretization, mean_spacing, split
 from jsmitsm.equation.problem import Problem
-from jsmitsm.particle.recursion import Recursion, constraints, row_lifts
-from jsmitsm.particle.recursion import split as fit_and_tail
+from jsmitsm.particle.recursion import Recursion, constraints, fit_and_tail, row_lifts
 from jsmitsm.runtime.tracers import any_number, concrete
 from jsmitsm.taylor.multi_indices import factorial, index_of
 

@@ -14,7 +14,7 @@ from jsmitsm.discretization.periodic import Images
 from jsmitsm.equation.problem import Problem
 from jsmitsm.particle.elimination import Scheme
 from jsmitsm.particle.kernels import EDGE, Kernel, fitted
-from jsmitsm.particle.recursion import split
+from jsmitsm.particle.recursion import fit_and_tail
 from jsmitsm.runtime.tracers import concrete, is_traced
 
 # Neighbours for every free coefficient, by the order of the expansions, where the particles are evenly spaced.
@@ -30,7 +30,7 @@ def scheme_size(scheme: Scheme) -> int:
         return rec.size
     if scheme.free:
         return len(scheme.free)
-    columns, _, rows, _ = split(rec)
+    columns, _, rows, _ = fit_and_tail(rec)
     return -(-(len(columns) - len(rows)) // rec.fields)
 
 

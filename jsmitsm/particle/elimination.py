@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm.particle.polynomials import whitening
-from jsmitsm.particle.recursion import Recursion, constraints, row_lifts, split, substitution
+from jsmitsm.particle.recursion import Recursion, constraints, fit_and_tail, row_lifts, substitution
 from jsmitsm.particle.small_systems import independent, min_norm, null_space
 from jsmitsm.taylor.multi_indices import Slot, factorial, multi_indices
 
@@ -106,7 +106,7 @@ def eliminate(scheme: Scheme, jac: Any, length: Any) -> Elimination:
     white = jnp.asarray(_whitening(rec))
     if scheme.method == "SSPH":
         return Elimination(white, jnp.zeros((white.shape[0], matrix.shape[0])), lift, rows)
-    low, _, first, _ = split(rec)
+    low, _, first, _ = fit_and_tail(rec)
     fitted = matrix if not rec.depth else matrix[first][:, low]
     if scheme.method == "S":
         if scheme.lost:
@@ -126,7 +126,7 @@ def eliminate(scheme: Scheme, jac: Any, length: Any) -> Elimination:
 def _deepened(scheme: Scheme, matrix: Any, basis: Any, particular: Any) -> tuple[Any, Any]:
     """Local solutions (F K, free) and (F K, rows) of all degrees, from those of the fit's."""
     rec = scheme.rec
-    low, high, first, deeper = split(rec)
+    low, high, first, deeper = fit_and_tail(rec)
     size = jnp.asarray(_fischer(rec)[high])
     across, deep = matrix[deeper][:, low], matrix[deeper][:, high] * size
     unit = _row_lengths(deep, jnp)[:, None]
@@ -151,7 +151,7 @@ def _slack(scheme: Scheme) -> np.ndarray:
     the tail that would meet them exactly grows as the Peclet number to the power of the depth. The ridge bounds it:
     measured at cell Peclet numbers from 5 to 1000, and without effect on elliptic operators.
     """
-    n = len(split(scheme.rec)[3])
+    n = len(fit_and_tail(scheme.rec)[3])
     return np.zeros((n, 0)) if scheme.flat else np.sqrt(RIDGE) * np.eye(n)
 
 
@@ -159,7 +159,7 @@ def _of_lower_rank(scheme: Scheme, fitted: Any, lift: Any, length: Any, white: A
     """Null space, pseudo-inverse and factors where some rows add nothing: by those that do, the largest first."""
     # Rows of unit length hide that rounding is all there is of one.
     rec = scheme.rec
-    first = split(rec)[2]
+    first = fit_and_tail(rec)[2]
     size = row_lifts(rec, length) / lift
     equation = np.array([e for e, _ in rec.row_index])
     largest = jnp.stack([jnp.max(jnp.where(equation == e, size, 0.0)) for e in range(len(rec.levels))])[equation]
@@ -194,7 +194,7 @@ def _eliminated(scheme: Scheme, jac: np.ndarray, length: float) -> Elimination:
     white = _whitening(rec)
     if scheme.method == "SSPH":
         return Elimination(white, np.zeros((white.shape[0], len(matrix))), lift, rows)
-    low, _, first, _ = split(rec)
+    low, _, first, _ = fit_and_tail(rec)
     fitted = matrix[np.ix_(first, low)] if rec.depth else matrix
     if scheme.method == "S":
         basis, particular = _refined(fitted, white)
@@ -213,7 +213,7 @@ def _deepened_on_host(
     scheme: Scheme, matrix: np.ndarray, basis: np.ndarray, particular: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     rec = scheme.rec
-    low, high, first, deeper = split(rec)
+    low, high, first, deeper = fit_and_tail(rec)
     size = _fischer(rec)[high]
     deep = matrix[np.ix_(deeper, high)] * size
     unit = _row_lengths(deep, np)
@@ -244,4 +244,4 @@ def _refined(matrix: np.ndarray, white: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def _all_free(scheme: Scheme) -> np.ndarray:
-    return np.setdiff1d(np.arange(len(split(scheme.rec)[0])), scheme.dependent)
+    return np.setdiff1d(np.arange(len(fit_and_tail(scheme.rec)[0])), scheme.dependent)

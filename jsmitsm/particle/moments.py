@@ -16,7 +16,7 @@ import numpy as np
 from jsmitsm.particle.elimination import Elimination, Scheme
 from jsmitsm.particle.kernels import EDGE, Kernel, fitted
 from jsmitsm.particle.polynomials import FEW, Combinations, functionals, monomials
-from jsmitsm.particle.recursion import Recursion, split
+from jsmitsm.particle.recursion import Recursion, fit_and_tail
 from jsmitsm.particle.small_systems import (
     general_inverse,
     gram_inverse,
@@ -136,7 +136,7 @@ def local_system(
         z, own_solve = null_space(own_rows @ basis)
         basis = basis @ z
         tests = None if tests is None else tests @ z
-    low = split(rec)[0]
+    low = fit_and_tail(rec)[0]
     fitted_values: Any = values
     if scheme.flat and rec.depth:
         short = plain and len(low) <= FEW

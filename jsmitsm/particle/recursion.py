@@ -124,7 +124,7 @@ def _rows(rec: Recursion) -> list[tuple[int, tuple[int, ...]]]:
 
 
 @lru_cache(maxsize=64)
-def split(rec: Recursion) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def fit_and_tail(rec: Recursion) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Columns and rows of the fit, and those that are deeper: (low, high) columns, (low, high) rows.
 
     A field counts with its weight, so that no row of the fit reaches a column beyond it. Without depth every
