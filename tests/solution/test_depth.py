@@ -128,11 +128,12 @@ def test_the_tail_of_method_iii():
     assert deep * 3 < flat
 
 
-def test_nothing_changes_where_nothing_is_asked_for():
-    plain, none = (solved(poisson, wave, **options)[0] for options in ({}, {"depth": 0}))
-    assert np.array_equal(plain.u, none.u) and none.depth == 0 and none.stats["depth"] == 0
-    deep = solved(poisson, wave, depth=2)[0]
-    assert deep.stats["depth"] == deep.depth == 2 and "depth=2" in repr(deep)
+@pytest.mark.parametrize("method, depth", [("S", 4), ("III", 0)])
+def test_without_a_word_it_is_as_deep_as_pays(method, depth):
+    """The paper's methods stay the paper's."""
+    plain, asked = (solved(poisson, wave, method=method, **options)[0] for options in ({}, {"depth": depth}))
+    assert np.array_equal(plain.u, asked.u)
+    assert plain.stats["depth"] == plain.depth == depth and (f"depth={depth}" in repr(plain)) == (depth > 0)
 
 
 def test_auto_goes_as_deep_as_pays():
