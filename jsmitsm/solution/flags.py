@@ -62,7 +62,7 @@ CLEAR = {"roughness": 0.05, "source": 0.01, "excess": 10.0, "coefficient": 0.1}
 CLEAR_WAVE = 0.1  # of PHASE
 # The operator's coefficients at a neighbour differ from their Taylor polynomials by this part of the largest term.
 COEFFICIENT = 0.3
-# By so much more the series of a coefficient has nothing to do with it, and what all orders agree on is another problem.
+# By so much more its series has nothing to do with a coefficient, and all orders agree on another problem.
 DIVERGENT = 100.0
 # The estimate passes through the same inverse: of a condition so many times the usual one it can tell nothing.
 BLIND = 1e6

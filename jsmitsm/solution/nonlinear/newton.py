@@ -124,7 +124,7 @@ def _refuse_degenerate(run: Run) -> None:
 
 
 def _searched(record: Record, begin: Iterate, first: Iterate) -> Found:
-    """Damped steps; where they lead nowhere, pseudo-time steps, and in the end full ones."""
+    """Damped steps; where they lead nowhere, those without depth, in pseudo-time, and in the end full ones."""
     if not np.isfinite(first.values).all():
         return Found(first, np.inf, False, np.zeros(0, int))
     best = _damped(record, begin, first)
