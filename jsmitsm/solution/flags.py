@@ -18,8 +18,8 @@ import numpy as np
 from jsmitsm.discretization.health import LEBESGUE
 from jsmitsm.discretization.leave_one_out import right_side
 from jsmitsm.discretization.operator_kind import cell_peclet, mean_spacing, usual_condition, wave_number
+from jsmitsm.discretization.resolution.steepness import steepness, unseen
 from jsmitsm.discretization.rows import all_rows
-from jsmitsm.discretization.steepness import steepness, unseen
 from jsmitsm.runtime.errors import some
 from jsmitsm.solution.between import between
 
