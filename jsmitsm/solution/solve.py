@@ -29,7 +29,7 @@ def solve(
     *,
     method: Method = "S",
     order: int = 4,
-    depth: Depth = 0,
+    depth: Depth = "auto",
     kernel: Kernel | None = None,
     stencils: Stencils | None = None,
     basis_terms: int | None = None,
@@ -93,7 +93,7 @@ def solve(
 def prepared(
     problem: Problem, cloud: Cloud, *, method: str = "S", order: int = 4, kernel: Kernel | None = None,
     stencils: Stencils | None = None, basis_terms: int | None = None, formulation: str = "auto", solver: str = "auto",
-    u0: Any = None, throw: bool = True, depth: Depth = 0,
+    u0: Any = None, throw: bool = True, depth: Depth = "auto",
 ) -> Run:  # fmt: skip
     """Checked arguments of :func:`solve`, discretised."""
     start = time.perf_counter()
