@@ -69,13 +69,14 @@ def from_sdf(
     rule = filling.spacing_function(spacing)
     region = levelset.SdfRegion(sdf, lo, hi)
     seed = _checked_seed(seed)
+    uniform = not callable(spacing)
     if len(lo) == 3:
-        boundary = surface.surface(region, rule, seed)
+        boundary = surface.surface(region, rule, uniform, seed)
     else:
-        boundary = (contour.line if len(lo) == 1 else contour.contour)(region, rule)
+        boundary = (contour.line if len(lo) == 1 else contour.contour)(region, rule, uniform)
     boundary = levelset.checked(region, boundary)
     named = _grouped(boundary.points, groups) if groups is not None else {"boundary": np.arange(len(boundary.points))}
-    return _cloud(region, rule, lo, hi, boundary, named, seed, not callable(spacing))
+    return _cloud(region, rule, lo, hi, boundary, named, seed, uniform)
 
 
 @bar("cloud")

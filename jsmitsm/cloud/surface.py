@@ -10,9 +10,9 @@ from jsmitsm.cloud.filling import Spacing
 _CORNER = np.cos(np.deg2rad(8.0))  # sides whose normals differ by more meet in an edge
 
 
-def surface(region: levelset.SdfRegion, spacing: Spacing, seed: int) -> levelset.Boundary:
+def surface(region: levelset.SdfRegion, spacing: Spacing, uniform: bool, seed: int) -> levelset.Boundary:
     """The zero level in 3D: foot points of small cells, thinned, relaxed on the surface, holes filled."""
-    cells, _ = levelset.cells_near(region, spacing, 0.5)
+    cells, _ = levelset.cells_near(region, spacing, 0.5, uniform)
     # One random point per cell: a lattice of feet could only be thinned to a few distinct densities.
     rng = np.random.default_rng(seed)
     close = np.abs(cells.distance) < 1.5 * cells.widths
@@ -20,7 +20,7 @@ def surface(region: levelset.SdfRegion, spacing: Spacing, seed: int) -> levelset
     starts = cells.centers[close] + rng.uniform(-0.5, 0.5, (len(width), 3)) * width[:, None]
     close = np.abs(region.distance(starts)[0]) < 0.6 * width
     starts, width = starts[close], width[close]
-    feet, arrived = region.project(starts, width)
+    feet, arrived, _ = region.project(starts, width)
     arrived &= np.linalg.norm(feet - starts, axis=1) < 2 * width
     feet, area = feet[arrived], width[arrived] ** 2 / 1.2  # volume of the layer over its thickness
     crossing = _crossing(region, feet)
@@ -85,7 +85,7 @@ def _relax_surface(region: levelset.SdfRegion, points: np.ndarray, spacing: Spac
             found = cKDTree(points).query(points, k=k)[1][:, 1:]
         move = h[:, None] * filling.repulsion(points, points, found, filling.scaling(h, h[found], 2))
         move -= np.einsum("md,md->m", move, normal)[:, None] * normal
-        new, arrived = region.project(points + move, 0.3 * h)
+        new, arrived, _ = region.project(points + move, 0.3 * h)
         arrived &= np.linalg.norm(new - points, axis=1) < 0.5 * h
         points = np.where(arrived[:, None], new, points)
     return points
