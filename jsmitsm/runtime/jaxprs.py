@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -20,6 +21,24 @@ DISCRETE = frozenset(
 NOTHING, CONSTANT_TERM, EVERYTHING = 0, 1, 2
 CALLS = {"jit", "pjit", "closed_call", "core_call", "call", "remat", "checkpoint", "remat2", "custom_vjp_call",
          "custom_vjp_call_jaxpr", "custom_lin", "custom_vmap_call", "composite"}  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Program:
+    """A jaxpr whose constants are kept elsewhere. JAX's own tells constants from inputs by the values it holds."""
+
+    constvars: tuple[Any, ...]
+    invars: tuple[Any, ...]
+    outvars: tuple[Any, ...]
+    eqns: tuple[Any, ...]
+
+
+def program(closed: ClosedJaxpr, last: int = 0) -> Program:
+    """The program of a trace without its constants; its ``last`` inputs become constants too."""
+    jaxpr = closed.jaxpr
+    inputs = len(jaxpr.invars) - last
+    constvars = (*jaxpr.constvars, *jaxpr.invars[inputs:])
+    return Program(constvars, tuple(jaxpr.invars[:inputs]), tuple(jaxpr.outvars), tuple(jaxpr.eqns))
 
 
 def called(eqn: Any) -> ClosedJaxpr | None:
