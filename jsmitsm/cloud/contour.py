@@ -5,14 +5,15 @@ from __future__ import annotations
 import numpy as np
 
 from jsmitsm.cloud import filling, levelset
-from jsmitsm.cloud.filling import Spacing
+from jsmitsm.cloud.packing import octree, relaxation
+from jsmitsm.cloud.packing.octree import Spacing
 
 _CORNER = np.cos(np.deg2rad(8.0))  # normals that differ by more, however close, make a corner
 
 
-def line(region: levelset.SdfRegion, spacing: Spacing, uniform: bool) -> levelset.Boundary:
+def line(region: levelset.SdfRegion, spacing: Spacing) -> levelset.Boundary:
     """Ends of the intervals in 1D."""
-    cells, coarse = levelset.cells_near(region, spacing, 0.5, uniform)
+    cells, coarse = levelset.cells_near(region, spacing, 0.5)
     x = np.concatenate([cells.centers, coarse.centers])
     x = x[np.argsort(x[:, 0])]
     negative = region.values(x) < 0
@@ -22,9 +23,9 @@ def line(region: levelset.SdfRegion, spacing: Spacing, uniform: bool) -> levelse
     return levelset.Boundary(points, np.where(negative[change + 1], -1.0, 1.0)[:, None])
 
 
-def contour(region: levelset.SdfRegion, spacing: Spacing, uniform: bool) -> levelset.Boundary:
+def contour(region: levelset.SdfRegion, spacing: Spacing) -> levelset.Boundary:
     """The zero level in 2D: closed polylines from marching triangles, cut at corners, divided evenly."""
-    cells, coarse = levelset.cells_near(region, spacing, 0.4, uniform)
+    cells, coarse = levelset.cells_near(region, spacing, 0.4)
     loops = _without_tips(region, _polylines(region, cells, coarse), spacing)
     if not loops:
         raise ValueError("spacing: too coarse for the shape, no boundary was found; reduce it below the shape's width")
@@ -59,11 +60,11 @@ def _without_tips(
     return large
 
 
-def _polylines(region: levelset.SdfRegion, cells: filling.Cells, coarse: filling.Cells) -> list[levelset.Boundary]:
+def _polylines(region: levelset.SdfRegion, cells: octree.Cells, coarse: octree.Cells) -> list[levelset.Boundary]:
     """Closed polylines of the zero level, with normals, domain on the left: marching triangles."""
     found = _crossings(region, cells)
     if found is None:  # the boundary leaves the cells near it: the function is far from a distance
-        found = _crossings(region, filling.join([cells, coarse]))
+        found = _crossings(region, octree.join([cells, coarse]))
     assert found is not None  # beyond the box everything is positive
     points, after = found
     follow, loops, seen = after.tolist(), [], [False] * len(after)
@@ -87,7 +88,7 @@ def _polylines(region: levelset.SdfRegion, cells: filling.Cells, coarse: filling
     return [part for part in parts if len(part.points) > 2]
 
 
-def _crossings(region: levelset.SdfRegion, cells: filling.Cells) -> tuple[np.ndarray, np.ndarray] | None:
+def _crossings(region: levelset.SdfRegion, cells: octree.Cells) -> tuple[np.ndarray, np.ndarray] | None:
     """Points (E, 2) where edges of the triangles cross the zero level, and the one that follows each, domain on the
     left; None where the boundary leaves the cells.
 
@@ -145,7 +146,7 @@ def _without_specks(loop: np.ndarray, normals: np.ndarray) -> levelset.Boundary:
     return levelset.Boundary(loop[kept], normals[kept])
 
 
-def _check_seen(region: levelset.SdfRegion, cells: filling.Cells, found: np.ndarray) -> None:
+def _check_seen(region: levelset.SdfRegion, cells: octree.Cells, found: np.ndarray) -> None:
     """Raise if some part of the zero level is too small to show up in the polylines."""
     from scipy.spatial import cKDTree
 
@@ -188,7 +189,7 @@ def _divided_loop(region: levelset.SdfRegion, found: levelset.Boundary, spacing:
     smooth, outward = _on_level(region, smooth, spacing)
     points = np.concatenate([corners.points, smooth])
     normals = np.concatenate([corners.normals, levelset.crossing_normals(smooth, outward)])
-    kept = filling.uncrowded(points, spacing(points), len(after))
+    kept = relaxation.uncrowded(points, spacing(points), len(after))
     return levelset.Boundary(points[kept], normals[kept])
 
 

@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jsmitsm.cloud import filling
-from jsmitsm.cloud.filling import Spacing
+from jsmitsm.cloud.packing import octree
+from jsmitsm.cloud.packing.octree import Spacing
 from jsmitsm.cloud.sdf.recorded import Recorded
 
 LEAST = 5.0  # spacings round a boundary component below which its shape is lost
@@ -132,17 +133,17 @@ def checked(region: SdfRegion, boundary: Boundary) -> Boundary:
 
 
 def cells_near(
-    region: SdfRegion, spacing: Spacing, fraction: float, uniform: bool
-) -> tuple[filling.Cells, filling.Cells]:
+    region: SdfRegion, spacing: Spacing, fraction: float
+) -> tuple[octree.Cells, octree.Cells]:
     """Octree cells near the zero level, and the coarse ones around; raises for an empty domain."""
-    base = region.size / filling.BASE[len(region.lo)]
+    base = region.size / octree.BASE[len(region.lo)]
     pad = 1.01 * base
     # Off the middle: the centres of symmetric shapes, and lines on which the function touches zero, are not met.
     shift = 0.1 * base * np.array([0.63, -0.41, 0.29])[: len(region.lo)]
-    if uniform:  # cells as wide as wanted at the end, not up to half as wide
-        wanted = fraction * float(spacing(region.lo[None])[0])
+    if isinstance(spacing, filling.Constant):  # cells as wide as wanted at the end, not up to half as wide
+        wanted = fraction * spacing.value
         base = min(base, wanted * 2.0 ** max(0.0, np.floor(np.log2(base / wanted))))
-    cells, coarse = filling.refine(
+    cells, coarse = octree.refine(
         region, spacing, region.lo - pad + shift, region.hi + pad + shift, fraction, False, base
     )
     if not ((cells.distance < 0).any() or (coarse.distance < 0).any()):

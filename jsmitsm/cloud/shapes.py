@@ -9,7 +9,8 @@ import numpy as np
 
 from jsmitsm.cloud import contour, filling, levelset, polygons, surface
 from jsmitsm.cloud.cloud import INTERIOR, Cloud
-from jsmitsm.cloud.filling import Spacing, SpacingLike
+from jsmitsm.cloud.filling import SpacingLike
+from jsmitsm.cloud.packing.octree import Region, Spacing
 from jsmitsm.runtime.arrays import ArrayLike
 from jsmitsm.runtime.errors import short
 from jsmitsm.runtime.progress import bar
@@ -69,14 +70,13 @@ def from_sdf(
     rule = filling.spacing_function(spacing)
     region = levelset.SdfRegion(sdf, lo, hi)
     seed = _checked_seed(seed)
-    uniform = not callable(spacing)
     if len(lo) == 3:
-        boundary = surface.surface(region, rule, uniform, seed)
+        boundary = surface.surface(region, rule, seed)
     else:
-        boundary = (contour.line if len(lo) == 1 else contour.contour)(region, rule, uniform)
+        boundary = (contour.line if len(lo) == 1 else contour.contour)(region, rule)
     boundary = levelset.checked(region, boundary)
     named = _grouped(boundary.points, groups) if groups is not None else {"boundary": np.arange(len(boundary.points))}
-    return _cloud(region, rule, lo, hi, boundary, named, seed, uniform)
+    return _cloud(region, rule, lo, hi, boundary, named, seed, not callable(spacing))
 
 
 @bar("cloud")
@@ -135,7 +135,7 @@ def from_polygon(
 
 
 def _cloud(
-    region: filling.Region,
+    region: Region,
     spacing: Spacing,
     lo: np.ndarray,
     hi: np.ndarray,
@@ -159,7 +159,7 @@ def _cloud(
 
 
 def _own_normals(
-    region: filling.Region, spacing: Spacing, boundary: levelset.Boundary, named: dict[str, np.ndarray]
+    region: Region, spacing: Spacing, boundary: levelset.Boundary, named: dict[str, np.ndarray]
 ) -> np.ndarray:
     """The normals (B, D), at corners between groups those of the own side: what is said of a side holds to its end."""
     points, normals = boundary

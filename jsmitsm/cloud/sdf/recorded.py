@@ -9,18 +9,20 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
+from jax.extend.core import ClosedJaxpr
 
 from jsmitsm.runtime.compiled import fingerprint, kept
 from jsmitsm.runtime.errors import IN_FUNCTIONS, in_words
 from jsmitsm.runtime.jaxprs import inlined, inner_jaxprs
+from jsmitsm.runtime.recall.recording import recalled
 from jsmitsm.runtime.snapshot import snapshot
+from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.taylor import jets, series
 
 # Points of one call of a compiled program, which is compiled for these two numbers only.
 _CALLS = (512, 8192)
-# Numbers computed for a batch of points up to which numpy is as fast as starting a program: some milliseconds. It is the
-# batch alone that decides, not what has been compiled: the same shape gives the same cloud, bit by bit, at any time.
+# Numbers computed for a batch up to which numpy will do: some milliseconds. The batch alone decides, not what
+# has been compiled before: the same shape gives the same cloud, bit by bit, at any time.
 _AT_ONCE = 300_000
 
 
@@ -32,7 +34,9 @@ class Recorded:
     """
 
     def __init__(self, sdf: Any, dim: int):
-        self._closed, self._dim = _recorded(sdf, dim), dim
+        make = lambda: _recorded(sdf, dim)  # noqa: E731
+        self._closed: ClosedJaxpr = recalled(sdf, ("sdf", dim), make, lambda closed: not is_traced(closed.consts))
+        self._dim = dim
         self._cost = _numbers(self._closed.jaxpr)
 
     def __call__(self, x: np.ndarray, gradients: bool = True) -> tuple[np.ndarray, np.ndarray]:
