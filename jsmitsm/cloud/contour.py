@@ -108,8 +108,8 @@ def _crossings(region: levelset.SdfRegion, cells: octree.Cells) -> tuple[np.ndar
     nodes = np.concatenate([origin + place * unit, cells.centers[order]])
     value = region.values(nodes)
     negative = value < 0
-    a = number.reshape(-1, 4)
-    center, a, b = np.repeat(np.arange(len(a)), 4), a.ravel(), np.roll(a, -1, axis=1).ravel()
+    number = number.reshape(-1, 4)
+    center, a, b = np.repeat(np.arange(len(number)), 4), number.ravel(), np.roll(number, -1, axis=1).ravel()
     while width[0] < width[-1]:  # sides with corners of finer cells on them
         between = place[a] + place[b]
         at = np.minimum(np.searchsorted(names, name(between // 2)), len(names) - 1)

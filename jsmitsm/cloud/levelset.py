@@ -58,6 +58,9 @@ class SdfRegion:
     def evaluate(self, x: np.ndarray, gradients: bool = True) -> tuple[np.ndarray, np.ndarray]:
         """Values (M,) and, if asked for, gradients (M, D); outside of the box everything is positive."""
         value, gradient = self._recorded(x, gradients)
+        if len(x) == 0 or (x.min(axis=0) >= self.lo).all() and (x.max(axis=0) <= self.hi).all():
+            if np.isfinite(value).all():
+                return value, gradient
         beyond = np.maximum(self.lo - x, x - self.hi)
         out = beyond.max(axis=1)
         bad = np.flatnonzero(~np.isfinite(value) & (out <= 0))

@@ -67,9 +67,9 @@ def refine(
     children = np.array(list(itertools.product((-0.25, 0.25), repeat=dim)))
     done: list[Cells] = []
     left: list[Cells] = []
-    changes = _sign_changes(np.sign(region.distance(centers)[0]).reshape(counts)).reshape(-1)
+    distance, outward = region.distance(centers)
+    changes = _sign_changes(np.sign(distance).reshape(counts)).reshape(-1)
     while len(centers):
-        distance, outward = region.distance(centers)
         # Twice the half diagonal: a signed distance function may be wrong by that factor.
         near = ~(np.abs(distance) > np.sqrt(dim) * width) | changes
         wanted = near | (distance < 0) if inside else near
@@ -90,6 +90,7 @@ def refine(
             )
         split = centers[split]
         centers = (split[:, None] + width * children).reshape(-1, dim)
+        distance, outward = region.distance(centers)
         changes = np.zeros(len(centers), bool)
         width /= 2
     return join(done), join(left)

@@ -39,7 +39,7 @@ def relax(
             reach = (scale * np.linalg.norm(points[:, None] - every[found], axis=2)) < 2.0
             near = np.flatnonzero(((found >= count) & (found < count + walls) & reach).any(axis=1))
         points += h[:count, None] * repulsion(points, every, found, scale)
-        if len(near) and step % 2:
+        if len(near) and step % 3 == 2:
             distance, outward = region.distance(points[near])
             push = np.clip(distance + CLEARANCE * h[near], 0.0, 0.3 * h[near])
             points[near] -= push[:, None] * outward
