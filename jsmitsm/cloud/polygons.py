@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from jsmitsm.cloud import filling, levelset
-from jsmitsm.cloud.filling import Spacing
+from jsmitsm.cloud.packing import relaxation
+from jsmitsm.cloud.packing.octree import Spacing
 
 _SHARP = np.deg2rad(20.0)  # a vertex that turns by more is a corner of the shape, not a sample of a curve
 
@@ -154,7 +155,7 @@ def edge_particles(loop: np.ndarray, spacing: Spacing, name: str) -> levelset.Bo
     at, outward = np.concatenate(points), np.concatenate(normals)
     firsts = np.cumsum([0] + [len(part) for part in points[:-1]])  # the vertices that are kept
     order = np.concatenate([firsts, np.setdiff1d(np.arange(len(at)), firsts)])
-    order = order[filling.uncrowded(at[order], spacing(at[order]), len(firsts))]
+    order = order[relaxation.uncrowded(at[order], spacing(at[order]), len(firsts))]
     return levelset.Boundary(at[np.sort(order)], outward[np.sort(order)])
 
 

@@ -9,7 +9,8 @@ import numpy as np
 
 from jsmitsm.cloud import contour, filling, levelset, polygons, surface
 from jsmitsm.cloud.cloud import INTERIOR, Cloud
-from jsmitsm.cloud.filling import Spacing, SpacingLike
+from jsmitsm.cloud.filling import SpacingLike
+from jsmitsm.cloud.packing.octree import Region, Spacing
 from jsmitsm.runtime.arrays import ArrayLike
 from jsmitsm.runtime.errors import short
 from jsmitsm.runtime.progress import bar
@@ -134,7 +135,7 @@ def from_polygon(
 
 
 def _cloud(
-    region: filling.Region,
+    region: Region,
     spacing: Spacing,
     lo: np.ndarray,
     hi: np.ndarray,
@@ -158,7 +159,7 @@ def _cloud(
 
 
 def _own_normals(
-    region: filling.Region, spacing: Spacing, boundary: levelset.Boundary, named: dict[str, np.ndarray]
+    region: Region, spacing: Spacing, boundary: levelset.Boundary, named: dict[str, np.ndarray]
 ) -> np.ndarray:
     """The normals (B, D), at corners between groups those of the own side: what is said of a side holds to its end."""
     points, normals = boundary
