@@ -32,11 +32,11 @@ _WIDE = 8192
 # pieces. Up to so many particles a program is compiled with less effort, in a half or a sixth of the time; what that
 # costs in running is about a millisecond a call.
 _ALONE: Any = {"xla_cpu_multi_thread_eigen": False}
-_PLAIN: Any = _ALONE | {"xla_cpu_use_fusion_emitters": False, "xla_cpu_parallel_codegen_split_count": 1}
-QUICKLY: Any = _PLAIN | {"xla_backend_optimization_level": 0}
+PLAIN: Any = _ALONE | {"xla_cpu_use_fusion_emitters": False, "xla_cpu_parallel_codegen_split_count": 1}
+QUICKLY: Any = PLAIN | {"xla_backend_optimization_level": 0}
 _EFFORT = (
     (FEW, QUICKLY),
-    (2048, _PLAIN | {"xla_backend_optimization_level": 1}),
+    (2048, PLAIN | {"xla_backend_optimization_level": 1}),
     (np.inf, _ALONE),
 )
 # Up to so many Taylor coefficients, or so many where all share an elimination, one kernel is faster than many and
@@ -67,7 +67,7 @@ class Operands(NamedTuple):
 
 def in_cloud_size(tree: Any, n: int) -> Any:
     """Arrays of all n particles padded to the size class of the cloud; what is padded is not padded again."""
-    return _widened(tree, n, cloud_size(n))
+    return widened(tree, n, cloud_size(n))
 
 
 def _pad(x: Any, n: int, size: int) -> Any:
@@ -78,7 +78,7 @@ def _pad(x: Any, n: int, size: int) -> Any:
     return xp.concatenate([x, xp.broadcast_to(x[:1], (size - n, *x.shape[1:]))])
 
 
-def _widened(tree: Any, n: int, size: int) -> Any:
+def widened(tree: Any, n: int, size: int) -> Any:
     """Every array of n particles padded to ``size``; those that are not traced stay on the host."""
     return tree if n == size else _all_padded(tree, n, size)
 
@@ -89,7 +89,7 @@ def _all_padded(tree: Any, n: int, size: int) -> Any:
 
 
 @partial(in_one_program, static=("m",))
-def _cut(tree: Any, m: int) -> Any:
+def cut(tree: Any, m: int) -> Any:
     """The first m particles. On the host where nothing is traced: an eager slice would compile for every length."""
     return jax.tree.map(lambda x: x[:m] if isinstance(x, jax.core.Tracer) else _first(np.asarray(x), m), tree)
 
@@ -117,18 +117,18 @@ def _in_size_classes(function: Any) -> Any:
         known = compiled.setdefault(form, set())
         size = at_hand(known, m, 2 * m, padded_size(m, 4)) if loose else at_hand(known, m, 1.25 * m, padded_size(m))
         points, kernel, data, whole = in_cloud_size((points, kernel, operands.data, whole), n)
-        ids, neighbours, jac, own, each = _widened(
+        ids, neighbours, jac, own, each = widened(
             (ids, neighbours, None if one_for_all else jac, operands.own, each), m, size
         )
         jac, count = operands.jac if one_for_all else jac, np.int32(m)
         given = Operands(jac, own, data, operands.shared, operands.lengths, count)
         arguments = dict(zip(names, (points, kernel, ids, neighbours, given, each, whole)))
         if inside or (kernel is not None and closes_over_traced(kernel.tree_flatten()[1])):
-            return _cut(inner(scheme, **arguments), m)
+            return cut(inner(scheme, **arguments), m)
         options = next(some for most, some in _EFFORT if size <= most) if jax.default_backend() == "cpu" else {}
         most = _SMALL if operands.shared is None else _SMALL_SHARED
         small = scheme.rec.size * scheme.rec.fields <= most and one_kernel.available()
-        return _cut(called(function, {"scheme": scheme}, arguments, tuple(options.items()), small), m)
+        return cut(called(function, {"scheme": scheme}, arguments, tuple(options.items()), small), m)
 
     return padded
 
