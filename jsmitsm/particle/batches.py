@@ -32,11 +32,11 @@ _WIDE = 8192
 # pieces. Up to so many particles a program is compiled with less effort, in a half or a sixth of the time; what that
 # costs in running is about a millisecond a call.
 _ALONE: Any = {"xla_cpu_multi_thread_eigen": False}
-PLAIN: Any = _ALONE | {"xla_cpu_use_fusion_emitters": False, "xla_cpu_parallel_codegen_split_count": 1}
-QUICKLY: Any = PLAIN | {"xla_backend_optimization_level": 0}
+_PLAIN: Any = _ALONE | {"xla_cpu_use_fusion_emitters": False, "xla_cpu_parallel_codegen_split_count": 1}
+QUICKLY: Any = _PLAIN | {"xla_backend_optimization_level": 0}
 _EFFORT = (
     (FEW, QUICKLY),
-    (2048, PLAIN | {"xla_backend_optimization_level": 1}),
+    (2048, _PLAIN | {"xla_backend_optimization_level": 1}),
     (np.inf, _ALONE),
 )
 # Up to so many Taylor coefficients, or so many where all share an elimination, one kernel is faster than many and
@@ -99,6 +99,11 @@ def _first(x: np.ndarray, m: int) -> np.ndarray:
     return x[:m] if len(x) <= 1.25 * m else x[:m].copy()
 
 
+def effort(size: int) -> Any:
+    """The compiler's options for programs over so many particles."""
+    return next(some for most, some in _EFFORT if size <= most) if jax.default_backend() == "cpu" else {}
+
+
 def _in_size_classes(function: Any) -> Any:
     """Compile ``function(scheme, points, kernel, ids, neighbours, operands, each, whole)``, and call it
     with every particle axis padded: that of ``ids``, and that of the cloud."""
@@ -125,7 +130,7 @@ def _in_size_classes(function: Any) -> Any:
         arguments = dict(zip(names, (points, kernel, ids, neighbours, given, each, whole)))
         if inside or (kernel is not None and closes_over_traced(kernel.tree_flatten()[1])):
             return cut(inner(scheme, **arguments), m)
-        options = next(some for most, some in _EFFORT if size <= most) if jax.default_backend() == "cpu" else {}
+        options = effort(size)
         most = _SMALL if operands.shared is None else _SMALL_SHARED
         small = scheme.rec.size * scheme.rec.fields <= most and one_kernel.available()
         return cut(called(function, {"scheme": scheme}, arguments, tuple(options.items()), small), m)

@@ -92,8 +92,7 @@ def _in_size_class(function: Any) -> Any:
         given = {"points": points, "sides": tuple(made), "coef": batches.widened(coef, n, size), "more": more}
         if recorded():
             return batches.cut(inner(scheme, **given), n)
-        options = batches.PLAIN if jax.default_backend() == "cpu" else {}
-        return batches.cut(called(function, {"scheme": scheme}, given, tuple(options.items())), n)
+        return batches.cut(called(function, {"scheme": scheme}, given, tuple(batches.effort(size).items())), n)
 
     return padded
 
@@ -107,8 +106,7 @@ def joint_rows(scheme: JointScheme, points: Any, sides: tuple[Side, ...], coef: 
     """
 
     def one(given: Any) -> tuple[Row, ...]:
-        joint = _joint(scheme, points, sides, *given)
-        return tuple(_row(scheme, joint, k) for k in range(len(sides)))
+        return _rows(scheme, _joint(scheme, points, sides, *given))
 
     made = jax.lax.map(jax.checkpoint(one), (_each(sides), coef), batch_size=BLOCK)
     # No neighbour's condition is data here.
@@ -213,37 +211,38 @@ def _powers(scheme: Scheme, length: Any) -> Any:
     return length ** jnp.asarray(scheme.rec.weights, length.dtype)
 
 
-def _targets(scheme: JointScheme, k: int) -> np.ndarray:
-    """The constants of side k among all coefficients, (F, sum F K)."""
-    rec = scheme.sides[k].rec
-    start = sum(s.rec.fields * s.rec.size for s in scheme.sides[:k])
-    total = sum(s.rec.fields * s.rec.size for s in scheme.sides)
-    out = np.zeros((rec.fields, total))
-    out[np.arange(rec.fields), start + np.arange(rec.fields) * rec.size] = 1.0
-    return out
+def _targets(scheme: JointScheme) -> np.ndarray:
+    """The constants of all sides among all coefficients, (M F, sum F K)."""
+    sizes = [(s.rec.fields, s.rec.size) for s in scheme.sides]
+    starts = np.cumsum([0] + [fields * size for fields, size in sizes])
+    places = [int(start) + f * size for start, (fields, size) in zip(starts, sizes) for f in range(fields)]
+    return np.eye(int(starts[-1]))[places]
 
 
-def _row(scheme: JointScheme, joint: _Joint, k: int) -> Row:
-    rec = scheme.sides[k].rec
-    wanted = jnp.asarray(_targets(scheme, k))
+def _rows(scheme: JointScheme, joint: _Joint) -> tuple[Row, ...]:
+    """The equations of all copies of one joint."""
+    wanted = jnp.asarray(_targets(scheme))
     root = safe_root(joint.weight)[:, None]
     a, target = root * joint.phi, joint.reduced.T @ wanted.T
     # Normal equations lose digits where a side hardly counts; what they miss is fitted again.
     w = min_norm(a, target)
     w = root * (w + min_norm(a, target - a.T @ w))
-    size = jnp.max(jnp.abs(target), initial=0.0)
-    defect = jnp.max(jnp.abs(target - joint.phi.T @ w), initial=0.0) / jnp.where(size > 0, size, 1.0)
+    size = jnp.max(jnp.abs(target), axis=0)
+    defect = jnp.max(jnp.abs(target - joint.phi.T @ w), axis=0) / jnp.where(size > 0, size, 1.0)
     rest = wanted.T - joint.values.T @ w
     v_own = joint.solve.T @ (joint.basis.T @ rest)
     v = joint.particular.T @ rest - (joint.rows @ joint.particular).T @ v_own
-    lift = 1.0 / (joint.root[k] * _powers(scheme.sides[k], joint.length))[:, None]
+    powers = [root * _powers(s, joint.length) for s, root in zip(scheme.sides, joint.root)]
+    lift = 1.0 / jnp.concatenate(powers)[:, None]
     weights = (w * joint.data_scale[:, None]).T * lift
-    fields = rec.fields
-    weights = weights.reshape(fields, -1, fields)
-    return Row(
-        weights, None, (v * joint.lifts[:, None]).T * lift,
-        (v_own * joint.scale[:, None]).T * lift, jnp.einsum("fgf->f", jnp.abs(weights)), defect, jnp.zeros(fields),
-    )  # fmt: skip
+    source, condition = (v * joint.lifts[:, None]).T * lift, (v_own * joint.scale[:, None]).T * lift
+    fields, out = scheme.sides[0].rec.fields, []
+    for k in range(len(scheme.sides)):
+        own = slice(k * fields, (k + 1) * fields)
+        mine = weights[own].reshape(fields, -1, fields)
+        size = jnp.einsum("fgf->f", jnp.abs(mine))
+        out.append(Row(mine, None, source[own], condition[own], size, jnp.max(defect[own]), jnp.zeros(fields)))
+    return tuple(out)
 
 
 def _expanded(scheme: JointScheme, joint: _Joint, values: Any, source: Any, given: Any) -> tuple[Any, ...]:

@@ -327,5 +327,5 @@ def _far_away(run: Any, values: np.ndarray, nums: Any, out: list[str], found: di
 
 
 # The tests that ask the whole system, and those that ask one region of several alone.
-OF_THE_WHOLE = (_condition, _round_off, _far_away)
+OF_THE_WHOLE = (_round_off, _condition, _far_away)
 OF_A_REGION = (_jumps, _waves, _roughness, _coefficients, _peclet)
