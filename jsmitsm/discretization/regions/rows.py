@@ -245,7 +245,7 @@ def _gathered(coefs: Any, values: Any, places: Any, rows: Any, none: Any) -> tup
     spread_, right = [], []
     for coef, value, place, (at, keep) in zip(coefs, values, places, rows):
         chosen = xp.asarray(coef)[at][:, keep]
-        spread_.append(chosen @ (np.asarray(place)[:, None] == np.arange(len(none))).astype(float))
+        spread_.append(chosen @ (place[:, None] == np.arange(len(none))).astype(float))
         right.append(xp.asarray(value)[at][:, keep])
     return xp.concatenate(spread_, axis=1), xp.concatenate(right, axis=1)
 

@@ -227,7 +227,7 @@ def _stacked(flux: Any, places: Any, jump: Any, source: Any, resistance: Any, no
     xp: Any = jnp if is_traced(flux, jump, source, resistance) else np
     fields, n_slots = len(jump), len(none)
     spread = [
-        xp.einsum("esn,st->net", jac, (np.asarray(place)[:, None] == np.arange(n_slots)).astype(float))
+        xp.einsum("esn,st->net", jac, (place[:, None] == np.arange(n_slots)).astype(float))
         for (jac, _), place in zip(flux, places)
     ]
     n = spread[0].shape[0]
