@@ -29,10 +29,8 @@ from jsmitsm.discretization.rows import all_rows
 from jsmitsm.particle.moments import Row
 from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.solution import flags
+from jsmitsm.solution.regions.flags import singular, weak_copies
 from jsmitsm.solution.run import Run
-
-# Rows of copies that amplify their neighbours' errors by more than this are a flag: their values are lost.
-WEAK = 10.0
 
 
 class RegionsRun(Run):
@@ -155,24 +153,16 @@ class RegionsRun(Run):
         for test in flags.OF_THE_WHOLE:
             test(self, values, self.nums, certain, found)
         doubts: list[str] = []
+        told: list[str]
         for part, own, rows in zip(self.disc.parts, self.nums.parts, self.parts):
-            told: list[str] = []
+            told = []
             view = copy(self)
             view.disc, view.rows, view.nums = part.disc, rows, own
             for test in flags.OF_A_REGION:
                 test(view, values[part.ids], own, told, {})
             doubts += [f"In the region {part.name!r}: {line[0].lower()}{line[1:]}" for line in told]
-        weak = self._weak_copies()
-        return [*certain, *(doubts if estimated() > flags.CLEARED else []), *weak, *self.against]
-
-    def _weak_copies(self) -> list[str]:
-        worst = max((float(np.max(row.lebesgue, initial=0.0)) for _, _, rows in self.bound for row in rows), default=0)
-        if worst <= WEAK:
-            return []
-        return [
-            f"Particles on an interface amplify their neighbours' errors up to {worst:.1e} times: the regions are too "
-            "coarse or too thin there; refine near the interface."
-        ]
+        told = [*weak_copies(self.bound), *singular(self.disc, values)]
+        return [*certain, *(doubts if estimated() > flags.CLEARED else []), *told, *self.against]
 
     def stats(self) -> dict[str, Any]:
         """What a user may want to know about the solve."""
