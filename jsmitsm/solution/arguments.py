@@ -67,12 +67,6 @@ def of_regions(problem: Any, cloud: Any) -> bool:
     return several
 
 
-def one_region(problem: Any, cloud: Any, what: str) -> None:
-    """ValueError for a problem with several regions, for which ``what`` is not made."""
-    if isinstance(cloud, RegionCloud) or of_regions(problem, cloud):
-        raise ValueError(f"{what}: not made for clouds of several regions; use js.solve")
-
-
 def check(
     problem, cloud, method, order, kernel, stencils, formulation="auto", solver="auto", u0=None, throw=True,
     depth=0,

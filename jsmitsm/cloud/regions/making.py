@@ -226,6 +226,13 @@ def _meet(sketch: _Sketch) -> None:
             f"shapes: the boundary of {names[int(member[:, lonely[0]].argmax())]!r} at {points[lonely[0]]} lies inside "
             "of another region: they overlap; subtract one from the other with js.sdf.difference"
         )
+    touching = {name for pair in sketch.interfaces for name in pair}
+    alone = [name for name in names if name not in touching]
+    if alone and len(names) > 1:
+        raise ValueError(
+            f"shapes: {alone[0]!r} touches no other region; is there a gap? let them touch exactly (the same function, "
+            "the same vertices, the same ends), and make a region that stands apart a cloud of its own"
+        )
     if points.shape[1] == 3:
         ends = np.flatnonzero((count > 1) & outer)
         many = np.flatnonzero(count > 2)
