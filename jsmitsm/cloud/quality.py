@@ -50,8 +50,9 @@ def quality(cloud: Cloud, spacing: filling.SpacingLike | None = None) -> Quality
     """
     if isinstance(cloud, RegionCloud):
         parts = [quality(cloud.region(name), spacing) for name in cloud.regions]
-        fill, separation, ratio, even, far, close = zip(*parts)
-        return Quality(max(fill), min(separation), max(ratio), min(even), max(far), min(close))
+        least = ("separation", "evenness", "separation_distance")
+        worst = {name: (min if name in least else max)(getattr(q, name) for q in parts) for name in Quality._fields}
+        return Quality(**worst)
     from scipy.spatial import cKDTree
 
     points = np.asarray(cloud.points)

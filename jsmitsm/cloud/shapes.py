@@ -178,7 +178,7 @@ def own_normals(
     at, which = np.nonzero(own)
     # A little towards a neighbour on the own side the distance grows along that side's normal.
     step, little = points[near[at, which]] - points[at], 1e-7
-    if getattr(region, "piecewise", False):  # known by distances to its edges: off its edges, and farther for the digits
+    if getattr(region, "piecewise", False):  # known by distances to edges: off them, and farther for the digits
         step += 0.1 * np.linalg.norm(step, axis=1, keepdims=True) * normals[at]
         little = 1e-3
     side = region.distance(points[at] + little * step)[1]

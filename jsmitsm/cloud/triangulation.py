@@ -19,7 +19,8 @@ def simplices(cloud: Cloud) -> np.ndarray:
 
     A simplex with boundary particles at all its corners lies outside where the normals point into it. Where normals
     are missing, it is dropped if its longest edge is much longer than the usual edges of its corners.
-    Those of a cloud of several regions do not cross an interface. Without normals the very corner of a notch may be filled, and what a particle on the very boundary sees across it.
+    Without normals the very corner of a notch may be filled, and what a particle on the very boundary sees across it.
+    Those of a cloud of several regions do not cross an interface.
 
     >>> import jsmitsm as js
     >>> simplices(js.rectangle((0, 0), (1, 1), (3, 3))).shape

@@ -1,9 +1,9 @@
 """Copies of a particle in several regions: one fit for all of them, bound by the conditions of the interfaces.
 
 Every copy s has its own recursion, solved for its free coefficients as elsewhere, U_s = Q_s F_s + B_s c_s, and its
-neighbours in its own region. The conditions between the copies (u_a - u_b + R q_a = g, q_a - q_b = f, with q the fluxes)
-and the conditions that they carry of their own bind the c_s exactly; what is left free is fitted to the neighbours of
-all. Each side counts with the root of its conductivity kappa_s, V_s = sqrt(kappa_s) U_s: the energies of the two sides
+neighbours in its own region. The conditions between the copies (u_a - u_b + R q_a = g, q_a - q_b = f, q the fluxes) and
+the conditions that they carry of their own bind the c_s exactly; what is left free is fitted to the neighbours of all.
+Each side counts with the root of its conductivity kappa_s, V_s = sqrt(kappa_s) U_s: the energies of the two sides
 compare, the values do not. Measured at ratios from 1e-6 to 1e6; without it the error grows with the ratio.
 
 Both copies' own values are left out, and each is an equation: it is predicted by the neighbours of all. The difference
@@ -102,7 +102,8 @@ def joint_rows(scheme: JointScheme, points: Any, sides: tuple[Side, ...], coef: 
     """The equations of all copies of n joints, a :class:`Row` for every side with the joint's axis first.
 
     Their weights run over the neighbours of all sides, one side after the other; ``source`` over the rows of all
-    sides' recursions, ``condition`` over the conditions between the copies (n, n_rows, S) and then over every side's own.
+    sides' recursions, ``condition`` over the conditions between the copies, whose coefficients are ``coef``
+    (n, n_rows, S), and then over every side's own.
     """
 
     def one(given: Any) -> tuple[Row, ...]:
@@ -117,7 +118,7 @@ def joint_rows(scheme: JointScheme, points: Any, sides: tuple[Side, ...], coef: 
 def joint_coefficients(scheme: JointScheme, points: Any, sides: tuple[Side, ...], coef: Any, more: Any) -> Any:
     """Taylor coefficients (n, F, K) of the copies on every side.
 
-    more: data, source, given. data: the values (N_s, F) of every side's particles; source (n, rows of all) and given (n, conditions) as the rows
+    more: the values (N_s, F) of every side's particles; source (n, rows of all) and given (n, conditions) as the rows
     of :func:`joint_rows` have them.
     """
 

@@ -144,7 +144,7 @@ class Run:
         self.__dict__.pop("factor", None)
         self.__dict__.pop("misfit", None)
 
-    def step(self, nums: Numbers, altered: Callable[..., Any] | None = None) -> tuple[Any, Any]:
+    def step(self, nums: Any, altered: Callable[..., Any] | None = None) -> tuple[Any, Any]:
         """Assemble and solve one linear system: values (N, F), and whether it went well.
 
         altered: a function of the system's entries, their rows and columns and the right-hand side that returns others.

@@ -200,7 +200,6 @@ def _meet(sketch: _Sketch) -> None:
     """Which shapes meet at every particle, and whether there is nothing on some side of it."""
     points, h = sketch.points, sketch.spacing(sketch.points)
     member = np.zeros((len(sketch.shapes), len(points)), bool)
-    covered = np.zeros((_PROBES, len(points)), bool)
     probes = _directions(points.shape[1])
     names = list(sketch.shapes)
     inside = np.zeros((len(names), len(probes), len(points)), bool)
@@ -210,13 +209,12 @@ def _meet(sketch: _Sketch) -> None:
             distance = shape.distance(points + _PROBE * h[:, None] * step)[0]
             inside[k, m] = distance < _PROBE * _PROBE * h  # a little outside counts: interfaces curve
         _check_overlap(sketch, names[k], points[~member[k]], h[~member[k]])
-    covered = inside.any(axis=0)
-    outer = ~covered.all(axis=0)
+    outer = np.asarray(~inside.any(axis=0).all(axis=0))
     sketch.outer = np.flatnonzero(outer)
     for i, first in enumerate(names):
         for j in range(i + 1, len(names)):
             both = np.flatnonzero(member[i] & member[j])
-            both = both[_share_a_side(inside[i], inside[j], member, both, points.shape[1])]
+            both = both[np.flatnonzero(_share_a_side(inside[i], inside[j], member, both, points.shape[1]))]
             if len(both):
                 sketch.interfaces[first, names[j]] = both
     count = member.sum(axis=0)
@@ -253,7 +251,7 @@ def _share_a_side(one: np.ndarray, two: np.ndarray, member: np.ndarray, at: np.n
         return np.ones(len(at), bool)
     a, b = one[:, at], two[:, at]
     touch = (a & np.roll(b, 1, axis=0)) | (b & np.roll(a, 1, axis=0)) | (a & b)
-    return touch.any(axis=0)
+    return np.asarray(touch.any(axis=0))
 
 
 def _directions(dim: int) -> np.ndarray:
@@ -297,8 +295,8 @@ def _check_gaps(sketch: _Sketch) -> None:
         if len(near):
             other = next(n for n, ids in sketch.on.items() if near[0] in ids)
             raise ValueError(
-                f"shapes: a gap between {other!r} and {name!r} at {points[near[0]]}, thinner than the spacing; let them "
-                "touch exactly (the same function, the same vertices), or reduce the spacing"
+                f"shapes: a gap between {other!r} and {name!r} at {points[near[0]]}, thinner than the spacing; let "
+                "them touch exactly (the same function, the same vertices), or reduce the spacing"
             )
 
 
@@ -324,8 +322,8 @@ def _filled(sketch: _Sketch, seed: int, uniform: bool) -> dict[str, np.ndarray]:
                 bad = np.flatnonzero(deep < -0.1 * sketch.spacing(inside[name]))
                 if len(bad):
                     raise ValueError(
-                        f"shapes: {name!r} and {other!r} overlap at {inside[name][bad[0]]}; subtract one from the other "
-                        "with js.sdf.difference, or correct the polygons"
+                        f"shapes: {name!r} and {other!r} overlap at {inside[name][bad[0]]}; subtract one from the "
+                        "other with js.sdf.difference, or correct the polygons"
                     )
     return inside
 

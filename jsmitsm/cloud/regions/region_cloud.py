@@ -51,7 +51,7 @@ class RegionCloud(Cloud):
         self.points: Array = checked_points(points, owner)
         self.groups = checked_groups(groups, len(self.points))
         self.normals: Array | None = checked_normals(normals, self.points, self.groups)
-        self.interfaces = Groups(interfaces)
+        self.interfaces = Groups({name: np.asarray(pairs) for name, pairs in interfaces.items()})
         self.interface_normals: dict[str, Any] = {k: np.asarray(v, float) for k, v in interface_normals.items()}
         self._spacing: float | None = None
         _check_pairs(self, owner)

@@ -158,7 +158,9 @@ def discretize_regions(
     return Regions(problem, cloud, made, interfaces, meetings, table, held, none)
 
 
-def _region(problem: Problem, cloud: RegionCloud, name: str, order: int, depth: int | str, near: Any, sources: bool) -> Discretization:
+def _region(
+    problem: Problem, cloud: RegionCloud, name: str, order: int, depth: int | str, near: Any, sources: bool
+) -> Discretization:
     """The discretisation of one region; whatever is wrong with it is said to be this region's."""
     own = region_of(problem, cloud, name)
     try:
@@ -177,8 +179,8 @@ def _region(problem: Problem, cloud: RegionCloud, name: str, order: int, depth: 
         )
     if disc.scheme.n_data:
         raise ValueError(
-            f"bcs: a side of the region {name!r} has more conditions than the equation has fields, which is not made for "
-            "clouds of several regions; give it one for each field"
+            f"bcs: a side of the region {name!r} has more conditions than the equation has fields, which is not made "
+            "for clouds of several regions; give it one for each field"
         )
     return disc
 

@@ -251,7 +251,7 @@ def _gathered(coefs: Any, values: Any, places: Any, rows: Any, none: Any) -> tup
 
 
 def joint_sides(regions: Regions, nums: RegionNumbers, made: Joints) -> tuple[Any, Any]:
-    """The right-hand sides of the joints: sources (n, rows of all sides) and values of all conditions (n, conditions)."""
+    """The right-hand sides of the joints: sources (n, rows of all sides), values of all conditions (n, conditions)."""
     sources, given = [], [between_numbers(regions, nums, made)[1]]
     for k, scheme, ids in zip(made.parts, made.scheme.sides, made.ids.T):
         part = regions.parts[k]

@@ -12,7 +12,6 @@ import numpy as np
 from jsmitsm.equation.conditions import component
 from jsmitsm.equation.problem import Condition, Problem
 from jsmitsm.equation.regions.interface import INTERFACE
-from jsmitsm.equation.regions.per_region import PerRegion
 from jsmitsm.equation.traced import Traced
 from jsmitsm.runtime.errors import did_you_mean
 from jsmitsm.runtime.tracers import is_traced
@@ -96,8 +95,8 @@ def check_regions(problem: Problem, cloud: Any) -> None:
         if key not in interfaces:
             if turned in interfaces:
                 raise ValueError(
-                    f"bcs: the interface is called {turned!r}, not {key!r}: its names stand in the order of the regions, "
-                    f"and its normal points from {turned.split('|')[0]!r} to {turned.split('|')[1]!r}"
+                    f"bcs: the interface is called {turned!r}, not {key!r}: its names stand in the order of the "
+                    f"regions, and its normal points from {turned.split('|')[0]!r} to {turned.split('|')[1]!r}"
                 )
             if meant or "|" in key:
                 raise ValueError(
@@ -113,8 +112,8 @@ def check_regions(problem: Problem, cloud: Any) -> None:
     missing = [name for name in interfaces if name not in problem.bcs]
     if missing:
         raise ValueError(
-            f"bcs: no condition for the interface(s) {missing}; the cloud has {interfaces}. Give each "
-            f'js.interface(flux={{{missing[0].split("|")[0]!r}: f, {missing[0].split("|")[1]!r}: g}}), it is never guessed'
+            f"bcs: no condition for the interface(s) {missing}; the cloud has {interfaces}. Give each js.interface("
+            f'flux={{{missing[0].split("|")[0]!r}: f, {missing[0].split("|")[1]!r}: g}}), it is never guessed'
         )
 
 
@@ -163,7 +162,7 @@ def _check_flux(flux: Traced, fields: int, where: str) -> None:
     if not flux.slots:
         raise ValueError(f"{where}: does not depend on u; return +k n . grad u (or +traction)")
     if max(sum(b) for _, b in flux.slots) > 1:
-        raise ValueError(f"{where}: holds derivatives beyond the first, which a flux of a second-order equation has not")
+        raise ValueError(f"{where}: holds derivatives beyond the first, which fluxes of second-order equations lack")
 
 
 def _linearised(flux: Traced, points: Any, normals: Any, params: Any, at: Any, where: str) -> tuple[Any, Any]:
@@ -187,8 +186,8 @@ def _general(problem: Problem, residual: Traced, points: Any, normals: Any, wher
             raise ValueError(f"{where}: the residual does not depend on {'ab'[side]}, the field of one side")
     if residual.n_equations != 2 * fields:
         raise ValueError(
-            f"{where}: the residual returns {residual.n_equations} condition(s), but an interface of equations of second "
-            f"order takes {2 * fields}, two for each field"
+            f"{where}: the residual returns {residual.n_equations} condition(s), but an interface of equations of "
+            f"second order takes {2 * fields}, two for each field"
         )
     if max(sum(b) for _, (_, b) in slots) > 1:
         raise ValueError(f"{where}: the residual holds derivatives beyond the first")
@@ -216,7 +215,8 @@ def _flattened(jac: Any, res: Any, at: Any, n: int) -> tuple[Any, Any]:
 
 
 def _rows(
-    flux: list[tuple[Any, Any]], places: list[np.ndarray], jump: list[Any], source: list[Any], resistance: Any, n_slots: int
+    flux: list[tuple[Any, Any]], places: list[np.ndarray], jump: list[Any], source: list[Any], resistance: Any,
+    n_slots: int,
 ) -> tuple[Any, Any]:
     """u_a - u_b + R q_a = jump and q_a - q_b = source, field by field: coef (n, 2 F, S), value (n, 2 F)."""
     return _stacked(flux, places, jump, source, resistance, np.zeros(n_slots))

@@ -31,8 +31,8 @@ def weak_copies(bound: list[Any]) -> list[str]:
     if not len(at):
         return []
     return [
-        f"{len(at)} particle(s) on interfaces, first {some(at)}, amplify their neighbours' errors up to {worst:.1e} times: "
-        "the regions are too coarse or too thin there; refine near the interface."
+        f"{len(at)} particle(s) on interfaces, first {some(at)}, amplify their neighbours' errors up to {worst:.1e} "
+        "times: the regions are too coarse or too thin there; refine near the interface."
     ]
 
 

@@ -58,7 +58,9 @@ class RegionsRun(Run):
         """The rows of all regions and of the copies, numbered in the whole cloud."""
         first = self.health is None
         self.parts, self.bound = [], []
-        found, classes, rows = [], [], []
+        found: list[Health] = []
+        classes: list[Class] = []
+        rows: list[Row] = []
         for part, own in zip(self.disc.parts, nums.parts):
             made, some = all_rows(part.disc, own)
             if not is_traced(some):
@@ -71,11 +73,11 @@ class RegionsRun(Run):
             self.parts.append((made, some))
             classes += [in_whole(part, cls) for cls in made]
             rows += some
-        for made in joints(self.disc, nums):
-            some = joint_rows(self.disc, nums, made)
-            self.bound.append((made, *some))
-            classes += some[0]
-            rows += some[1]
+        for meeting in joints(self.disc, nums):
+            whose, equations = joint_rows(self.disc, nums, meeting)
+            self.bound.append((meeting, whose, equations))
+            classes += whose
+            rows += equations
         if is_traced(rows):
             return classes, rows
         before = self.health

@@ -24,8 +24,8 @@ class RegionsSolution(Solution):
     """A solution in several regions: a :class:`jsmitsm.Solution` whose values jump where the problem says so.
 
     ``sol(points)`` takes the region in which each point lies, as the particles of the interfaces tell;
-    ``sol(points, region="a")`` the expansions of that region, on the interface its side of it. ``sol.region("a")`` is the
-    solution of one region alone. Integrals and fluxes over an interface ``"a|b"`` take the side ``region``.
+    ``sol(points, region="a")`` the expansions of that region, on the interface its side of it. ``sol.region("a")`` is
+    the solution of one region alone. Integrals and fluxes over an interface ``"a|b"`` take the side ``region``.
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jsmitsm as js
@@ -84,18 +84,18 @@ class RegionsSolution(Solution):
         self.refuse_stacked()
         if region is not None:
             return self._one(region).derivative(points, multi_index, blend=blend, outside=outside)
-        points = checked_points(points, self.cloud.dim)
-        if is_traced(points) or isinstance(self.cloud.points, jax.core.Tracer):
+        at: Any = checked_points(points, self.cloud.dim)
+        if is_traced(at) or isinstance(self.cloud.points, jax.core.Tracer):
             raise ValueError(
                 "points: traced by a JAX transform, which side of an interface they are on is found on the host; name "
                 'the region, sol(points, region="a")'
             )
-        where = located(self.cloud, np.asarray(points))
-        out: Any = jnp.full((len(points), *jnp.shape(self.u)[1:]), jnp.nan)
+        where = located(self.cloud, np.asarray(at))
+        out: Any = jnp.full((len(at), *jnp.shape(self.u)[1:]), jnp.nan)
         for k, name in enumerate(self.cloud.regions):
             here = np.flatnonzero(where == k)
             if len(here):
-                made = self._one(name).derivative(points[here], multi_index, blend=blend, outside=outside)
+                made = self._one(name).derivative(at[here], multi_index, blend=blend, outside=outside)
                 out = out.at[here].set(made)
         return out
 
