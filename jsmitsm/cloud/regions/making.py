@@ -193,7 +193,7 @@ def _outward(shape: Shape, points: np.ndarray, spacing: Spacing) -> np.ndarray:
     length = np.linalg.norm(total, axis=1, keepdims=True)
     mean = np.where(length > 1e-6, total / np.maximum(length, 1e-300), normal)
     corner = (mean * normal).sum(axis=1) < np.cos(np.radians(5.0))
-    return np.where(corner[:, None] | ~normal.any(axis=1)[:, None], mean, normal)
+    return np.where(np.asarray(corner | ~normal.any(axis=1))[:, None], mean, normal)
 
 
 def _meet(sketch: _Sketch) -> None:
@@ -223,13 +223,6 @@ def _meet(sketch: _Sketch) -> None:
         raise ValueError(
             f"shapes: the boundary of {names[int(member[:, lonely[0]].argmax())]!r} at {points[lonely[0]]} lies inside "
             "of another region: they overlap; subtract one from the other with js.sdf.difference"
-        )
-    touching = {name for pair in sketch.interfaces for name in pair}
-    alone = [name for name in names if name not in touching]
-    if alone and len(names) > 1:
-        raise ValueError(
-            f"shapes: {alone[0]!r} touches no other region; is there a gap? let them touch exactly (the same function, "
-            "the same vertices, the same ends), and make a region that stands apart a cloud of its own"
         )
     if points.shape[1] == 3:
         ends = np.flatnonzero((count > 1) & outer)
@@ -280,7 +273,7 @@ def _check_overlap(sketch: _Sketch, name: str, points: np.ndarray, h: np.ndarray
 
 
 def _check_gaps(sketch: _Sketch) -> None:
-    """No two boundaries so near that they were meant to be one."""
+    """No two boundaries so near that they were meant to be one, no region that touches none."""
     points, h = sketch.points, sketch.spacing(sketch.points)
     for name, shape in sketch.shapes.items():
         away = np.setdiff1d(sketch.outer, sketch.on[name])
@@ -298,6 +291,13 @@ def _check_gaps(sketch: _Sketch) -> None:
                 f"shapes: a gap between {other!r} and {name!r} at {points[near[0]]}, thinner than the spacing; let "
                 "them touch exactly (the same function, the same vertices), or reduce the spacing"
             )
+    touching = {name for pair in sketch.interfaces for name in pair}
+    alone = [name for name in sketch.shapes if name not in touching]
+    if alone and len(sketch.shapes) > 1:
+        raise ValueError(
+            f"shapes: {alone[0]!r} touches no other region; is there a gap? let them touch exactly (the same function, "
+            "the same vertices, the same ends), and make a region that stands apart a cloud of its own"
+        )
 
 
 def _filled(sketch: _Sketch, seed: int, uniform: bool) -> dict[str, np.ndarray]:

@@ -82,8 +82,8 @@ class Polygons:
 
     curved, piecewise = False, True
 
-    def __init__(self, loops: list[np.ndarray], spacing: Spacing):
-        self._loops = loops
+    def __init__(self, name: str, loops: list[np.ndarray], spacing: Spacing):
+        self._name, self._loops = name, loops
         points = np.concatenate(loops)
         self.lo, self.hi = points.min(axis=0), points.max(axis=0)
         self.distance = polygons.PolygonRegion(loops, spacing).distance
@@ -93,7 +93,7 @@ class Polygons:
 
     def boundary(self, spacing: Spacing, seed: int, forced: np.ndarray) -> levelset.Boundary:
         parts = [
-            polygons.edge_particles(*polygons.with_vertices(loop, forced), spacing=spacing, name="shapes")
+            polygons.edge_particles(*polygons.with_vertices(loop, forced), spacing=spacing, name=self._name)
             for loop in self._loops
         ]
         return levelset.Boundary(*(np.concatenate(arrays) for arrays in zip(*parts)))
@@ -107,7 +107,7 @@ def shape_of(name: str, given: Any, bounds: Any, spacing: Spacing) -> Shape:
             raise ValueError(f"bounds: needed for the signed distance {where}; give a box (lo, hi) that contains it")
         return Level(given, *bounds)
     if hasattr(given, "geom_type"):
-        return Polygons(_shapely_loops(where, given), spacing)
+        return Polygons(where, _shapely_loops(where, given), spacing)
     try:
         array = np.asarray(given, float)
     except (TypeError, ValueError):
@@ -115,7 +115,7 @@ def shape_of(name: str, given: Any, bounds: Any, spacing: Spacing) -> Shape:
     if array.shape == (2,) and np.isfinite(array).all() and array[0] < array[1]:
         return Interval(float(array[0]), float(array[1]))
     if array.ndim == 2 and array.shape[1] == 2:
-        return Polygons(_checked_loops(where, given, ()), spacing)
+        return Polygons(where, _checked_loops(where, given, ()), spacing)
     raise ValueError(
         f"{where}: expected a signed distance (a function of x), a polygon (V, 2), a shapely geometry, or the ends "
         f"(a, b) of a layer with a < b, got {short(given)}"
