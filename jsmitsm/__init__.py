@@ -8,6 +8,7 @@ from jsmitsm.cloud.neighbours import Stencils, stencils
 from jsmitsm.equation.marks import meant
 from jsmitsm.equation.operators import divergence, grad, hessian, laplacian, partial
 from jsmitsm.equation.problem import Condition, Problem, condition, dirichlet, fix, free, neumann, periodic, robin
+from jsmitsm.equation.regions.interface import interface
 from jsmitsm.particle.kernels import Constant, CubicSpline, Gaussian, Kernel, SuperGaussian, Wendland
 from jsmitsm.runtime.errors import SolveError, did_you_mean
 from jsmitsm.runtime.progress import no_progress
@@ -19,9 +20,9 @@ __all__ = [
     "Cloud", "Condition", "Constant", "CubicSpline", "Factorization", "Formulation", "Gaussian", "Kernel", "Method",
     "Problem", "Quality", "Solution", "SolveError", "Solver", "Stencils", "SuperGaussian", "TuneResult", "Wendland",
     "box", "condition", "continuation", "dirichlet", "divergence", "factorize", "files", "fix", "free", "from_polygon",
-    "from_sdf", "grad", "hessian", "interval", "laplacian", "meant", "multi_indices", "neumann", "no_progress",
-    "partial", "periodic", "plot", "quadrature", "quality", "rectangle", "robin", "sdf", "show_versions", "solve",
-    "stencils", "tune",
+    "from_sdf", "grad", "hessian", "interface", "interval", "laplacian", "meant", "multi_indices", "neumann",
+    "no_progress", "partial", "periodic", "plot", "quadrature", "quality", "rectangle", "regions", "robin", "sdf",
+    "show_versions", "solve", "stencils", "tune",
 ]  # fmt: skip
 
 # Imported when first used, the solver too: who draws or makes clouds need not wait for it. Where each stands is said
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     from jsmitsm.cloud import sdf
     from jsmitsm.cloud.quadrature import quadrature
     from jsmitsm.cloud.quality import Quality, quality
+    from jsmitsm.cloud.regions.making import regions
     from jsmitsm.cloud.shapes import from_polygon, from_sdf
     from jsmitsm.linear.linsolve import Solver
     from jsmitsm.runtime.versions import show_versions
@@ -58,6 +60,7 @@ else:
         "quadrature": "cloud.quadrature",
         "quality": "cloud.quality",
         "sdf": "cloud",
+        "regions": "cloud.regions.making",
         "show_versions": "runtime.versions",
         "solve": "solution.solve",
         "tune": "tuning.tune",

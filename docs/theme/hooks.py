@@ -2,10 +2,13 @@
 
 import ast
 import html
+import json
 import re
 from pathlib import Path
 
+import griffe
 from latex2mathml.converter import convert
+from mkdocs.structure.files import File
 
 ROOT = Path(__file__).parents[2]
 MATH = re.compile(r'<(span|div) class="arithmatex">\\([(\[])(.*?)\\[)\]]</\1>', re.S)
@@ -33,11 +36,38 @@ def linked(match):
     return f'<autoref identifier="jsmitsm{match[1]}" optional>{match[0]}</autoref>'
 
 
+def on_files(files, config):
+    """The executed notebooks become pages."""
+    for path in sorted((ROOT / "notebooks").glob("*.ipynb")):
+        files.append(File.generated(config, f"notebooks/{path.stem}.md", content=notebook(json.loads(path.read_text()))))
+    return files
+
+
+def notebook(content):
+    """A notebook as Markdown: text, code, what the code printed, pictures."""
+    parts = []
+    for cell in content["cells"]:
+        source = "".join(cell["source"])
+        parts.append(source if cell["cell_type"] == "markdown" else f"```python\n{source}\n```")
+        for output in cell.get("outputs", []):
+            data = output.get("data", {})
+            text = "".join(output.get("text", data.get("text/plain", []))).rstrip()
+            if "image/png" in data:
+                picture = "".join(data["image/png"]).replace("\n", "")
+                parts.append(f'<img alt="drawn by the code above" src="data:image/png;base64,{picture}">')
+            elif text and output.get("name") != "stderr":
+                parts.append(f"```text\n{text}\n```")
+    return "\n\n".join(parts)
+
+
 def on_page_markdown(markdown, page, config, files):
-    """The table of all names, and links of pages that stand elsewhere in the repository."""
+    """The table of all names, and entries for those that no other page of the reference has."""
     if page.file.src_uri == "reference.md":
         rows = "\n".join(f"| `js.{name}` | {summary(name)} |" for name in public_names())
         markdown = markdown.replace("<!-- names -->", f"| name | what it is |\n| --- | --- |\n{rows}")
+        pages = "".join(path.read_text() for path in (ROOT / "docs" / "reference").glob("*.md"))
+        rest = [name for name in public_names() if not re.search(rf"^::: jsmitsm\.{name}$", pages, re.M)]
+        markdown += "\n\n" + "\n".join(f"::: jsmitsm.{name}" for name in rest)
     return markdown
 
 
@@ -50,8 +80,6 @@ def on_page_content(content, page, config, files):
 
 def summary(name):
     """The first line of a docstring, read and not imported."""
-    import griffe
-
     if "package" not in _read:
         loader = griffe.GriffeLoader(search_paths=[str(ROOT)])
         _read["package"] = loader.load("jsmitsm")

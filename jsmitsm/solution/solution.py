@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, Protocol
 
 import jax
@@ -213,7 +214,9 @@ class Solution:
             return self._error
         if self._fit is None:
             raise ValueError("error_estimate: this solution was pickled without its problem; ask before pickling")
-        error = error_estimate(self._fit, self._values)
+        # One of several regions brings its own.
+        estimate = getattr(self._fit, "error_estimate", partial(error_estimate, self._fit))
+        error = estimate(self._values)
         if not is_traced(error, self._values):
             self._error = frozen(error)
             self._share = share(np.reshape(error, np.shape(self._values)), np.asarray(self._values))
