@@ -12,7 +12,27 @@ from jsmitsm.cloud.regions.region_cloud import RegionCloud
 
 
 class Quality(NamedTuple):
-    """How evenly the particles of a cloud lie; see :func:`quality`."""
+    """How evenly the particles of a cloud lie; made by ``js.quality``.
+
+    Attributes
+    ----------
+    fill : float
+        Radius of the largest empty ball in the domain over the local spacing (0.58 for hexagons).
+    separation : float
+        Smallest distance of a pair over the local spacing (1 for any lattice).
+    mesh_ratio : float
+        fill / (separation / 2): 1.15 for hexagons, below 2 is even, above 4 is poor.
+    evenness : float
+        The least over the mean nearest distance, in local spacings.
+    fill_distance, separation_distance : float
+        The first two in length units (Wendland, Scattered Data Approximation, 2005, has half the latter).
+
+    Examples
+    --------
+    >>> import jsmitsm as js
+    >>> js.quality(js.interval(0.0, 1.0, 11)).mesh_ratio > 0.9
+    True
+    """
 
     fill: float
     separation: float

@@ -111,6 +111,11 @@ _shown: ContextVar[Any] = ContextVar("shown", default=None)
 def no_progress() -> Iterator[None]:
     """No progress bars inside this block.
 
+    Returns
+    -------
+    context manager
+        For a ``with`` statement.
+
     Examples
     --------
     >>> import jsmitsm as js

@@ -152,8 +152,30 @@ def _regions(cloud: Cloud) -> list[tuple[Cloud, dict[str, str]]]:
 
 def values(cloud: Cloud, numbers: Any, *, log: bool = False, label: str = "", at: Mapping[str, float] | None = None,
            levels: int = 20, colorbar: bool = True, ax: Any = None) -> Any:  # fmt: skip
-    """Any numbers (N,) at the particles as a map; ``log`` for a logarithmic scale. ``at``, ``levels``,
-    ``colorbar`` and ``ax`` as in :func:`solution`. Raises ValueError unless ``numbers`` are (N,) and finite.
+    """Any numbers at the particles as a map.
+
+    Parameters
+    ----------
+    cloud : Cloud
+        The particles.
+    numbers : array_like (N,)
+        One for each, finite.
+    log : bool
+        A logarithmic scale.
+    label : str
+        What the numbers are.
+    at, levels, colorbar, ax : optional
+        As in ``js.plot.solution``.
+
+    Returns
+    -------
+    Axes or array of Axes
+        In 3D an array, one per slice.
+
+    Raises
+    ------
+    ValueError
+        Unless ``numbers`` are (N,) and finite.
 
     Examples
     --------
@@ -182,10 +204,28 @@ def values(cloud: Cloud, numbers: Any, *, log: bool = False, label: str = "", at
 
 
 def error(sol: Solution, exact: Any, *, field: int = 0, log: bool = True, ax: Any = None, **options: Any) -> Any:
-    """The error |u - exact| at the particles; ``exact`` is an array (N,) or a function of one point x (D,).
+    """The error |u - exact| at the particles.
 
-    ``sol`` and ``field`` as in :func:`solution`, ``log`` and ``options`` go to :func:`values`. Raises ValueError for
-    an exact solution of another size.
+    Parameters
+    ----------
+    sol : Solution
+        Whose error.
+    exact : array_like (N,) or function
+        The exact values, or a function of one point x (D,).
+    field : int
+        The field of a system.
+    log, ax, **options : optional
+        As in ``js.plot.values``.
+
+    Returns
+    -------
+    Axes or array of Axes
+        In 3D an array, one per slice.
+
+    Raises
+    ------
+    ValueError
+        For an exact solution of another size.
 
     Examples
     --------
@@ -205,9 +245,21 @@ def error(sol: Solution, exact: Any, *, field: int = 0, log: bool = True, ax: An
 
 
 def estimate(sol: Solution, *, field: int = 0, log: bool = True, ax: Any = None, **options: Any) -> Any:
-    """The estimated error of a solution at the particles, :meth:`jsmitsm.Solution.error_estimate`, as a map.
+    """The estimated error at the particles, ``js.Solution.error_estimate``, as a map.
 
-    ``sol`` and ``field`` as in :func:`solution`, ``log``, ``ax`` and ``options`` go to :func:`values`.
+    Parameters
+    ----------
+    sol : Solution
+        Whose error.
+    field : int
+        The field of a system.
+    log, ax, **options : optional
+        As in ``js.plot.values``.
+
+    Returns
+    -------
+    Axes or array of Axes
+        In 3D an array, one per slice.
 
     Examples
     --------
@@ -224,7 +276,17 @@ def estimate(sol: Solution, *, field: int = 0, log: bool = True, ax: Any = None,
 def sparsity(what: Any, *, ax: Any = None) -> Any:
     """Which particles each particle looks at, as a matrix: row i has a dot for every neighbour of particle i.
 
-    ``what``: :class:`jsmitsm.Stencils`, a :class:`jsmitsm.Solution`, or a matrix (scipy.sparse or an array).
+    Parameters
+    ----------
+    what : Stencils, Solution, matrix or array
+        A matrix of scipy.sparse will do.
+    ax : Axes, optional
+        Where to draw.
+
+    Returns
+    -------
+    Axes
+        What it was drawn on.
 
     Examples
     --------
@@ -256,10 +318,25 @@ def sparsity(what: Any, *, ax: Any = None) -> Any:
 def tuning(result: Any, *, ax: Any = None) -> Any:
     """The history of a tuning: the objective and every parameter over the steps.
 
-    ``result``: what :func:`jsmitsm.tune` returned, or its ``history``: a mapping from ``"objective"`` and the
-    parameters' names to one entry per step, or a pytree of such. A parameter with one number per particle is
-    drawn as its median and its range. ``ax``: as many axes as there are panels. Returns an array of them. Raises
-    ValueError for a history without ``"objective"``.
+    A parameter with one number per particle is drawn as its median and its range.
+
+    Parameters
+    ----------
+    result : TuneResult or mapping
+        What ``js.tune`` returned, or its ``history``: from ``"objective"`` and the parameters' names to one entry
+        per step, or a pytree of such.
+    ax : array of Axes, optional
+        As many as there are panels.
+
+    Returns
+    -------
+    array of Axes
+        One per panel.
+
+    Raises
+    ------
+    ValueError
+        For a history without ``"objective"``.
 
     Examples
     --------
