@@ -59,13 +59,16 @@ class Cloud:
 
     Parameters
     ----------
-    points : (N, D) float array, D = 1, 2 or 3 (also in 1D), in length units.
-    groups : maps a name to an integer index array. The groups are disjoint and cover every
-        particle; ``"interior"`` is one of them, every other one is a boundary group.
-    normals : (N, D) unit outward normals, NaN in the interior. Needed only where a boundary
-        condition uses them.
-    cell_groups : maps a name to an integer index array, as the materials of a mesh do: these may overlap (a particle
-        between two materials belongs to both) and need not cover the cloud. No condition refers to them.
+    points : array_like (N, D)
+        (N, D) float array, D = 1, 2 or 3 (also in 1D), in length units.
+    groups : mapping
+        Maps a name to an integer index array. The groups are disjoint and cover every particle; ``"interior"`` is
+        one of them, every other one is a boundary group.
+    normals : array_like (N, D), optional
+        (N, D) unit outward normals, NaN in the interior. Needed only where a boundary condition uses them.
+    cell_groups : mapping, optional
+        Maps a name to an integer index array, as the materials of a mesh do: these may overlap (a particle between
+        two materials belongs to both) and need not cover the cloud. No condition refers to them.
 
     Raises
     ------
@@ -73,7 +76,7 @@ class Cloud:
         For a wrong shape, NaN, overlapping or incomplete groups, duplicate particles.
 
     A cloud is a pytree: points and normals are leaves, groups and cell groups are static. It does not change: its
-    arrays are read-only copies, and :meth:`replace` makes another one.
+    arrays are read-only copies, and ``replace`` makes another one.
 
     Examples
     --------

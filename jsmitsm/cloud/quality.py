@@ -50,9 +50,11 @@ def quality(cloud: Cloud, spacing: filling.SpacingLike | None = None) -> Quality
 
     Parameters
     ----------
-    cloud : a :class:`Cloud`. With normals the boundary is told exactly; without them the domain is taken to be convex.
+    cloud : Cloud
+        A ``js.Cloud``. With normals the boundary is told exactly; without them the domain is taken to be convex.
         Of several regions the worst of each measure counts.
-    spacing : a number or a function (M, D) -> (M,); by default the mean nearest distance near each particle.
+    spacing : float or function, optional
+        A number or a function (M, D) -> (M,); by default the mean nearest distance near each particle.
 
     Returns
     -------
@@ -64,6 +66,8 @@ def quality(cloud: Cloud, spacing: filling.SpacingLike | None = None) -> Quality
 
     Raises ValueError for fewer than D + 2 particles, and normals that point inward.
 
+    Examples
+    --------
     >>> import jsmitsm as js
     >>> round(js.quality(js.rectangle((0, 0), (1, 1), (11, 11))).mesh_ratio, 3)
     1.414

@@ -316,14 +316,18 @@ class Problem:
 
     Parameters
     ----------
-    pde : function ``(u, x)`` or ``(u, x, params)`` returning the residual at the point x (D,):
-        a scalar, or (F,) for a system. ``u`` is a local field, see :mod:`jsmitsm.equation.operators`. For a cloud of
-        several regions (:func:`jsmitsm.regions`) a dict of them, one for each region by its name.
-    bcs : maps each boundary group to a condition, or to a list of them where the operator's
-        order or the number of fields needs several; and each interface ``"a|b"`` to :func:`interface`.
-    fields : number F of unknown fields.
-    params : any pytree of numbers. Where it is given, every function of the problem takes it as
-        its last argument, and new numbers in it never recompile.
+    pde : function
+        Function ``(u, x)`` or ``(u, x, params)`` returning the residual at the point x (D,): a scalar, or (F,) for
+        a system. ``u`` is a local field, see ``jsmitsm.equation.operators``. For a cloud of several regions
+        (``js.regions``) a dict of them, one for each region by its name.
+    bcs : mapping
+        Maps each boundary group to a condition, or to a list of them where the operator's order or the number of
+        fields needs several; and each interface ``"a|b"`` to ``js.interface``.
+    fields : int
+        Number F of unknown fields.
+    params : pytree, optional
+        Any pytree of numbers. Where it is given, every function of the problem takes it as its last argument, and
+        new numbers in it never recompile.
 
     Raises
     ------

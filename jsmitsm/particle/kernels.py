@@ -26,11 +26,15 @@ class Kernel:
 
     Parameters
     ----------
-    profile : function r -> weight of a scalar scaled distance, written in ``jax.numpy``;
-        with ``params`` it is called as ``profile(r, params)``.
-    h : smoothing length in length units, a positive scalar or an (N,) array, one per particle.
-    d : dimensionless support radius; a particle has the neighbours |x - x_i| <= d h.
-    params : any pytree of numbers, further parameters of the profile.
+    profile : function
+        Function r -> weight of a scalar scaled distance, written in ``jax.numpy``; with ``params`` it is called as
+        ``profile(r, params)``.
+    h : float or array_like (N,)
+        Smoothing length in length units, a positive scalar or an (N,) array, one per particle.
+    d : float
+        Dimensionless support radius; a particle has the neighbours |x - x_i| <= d h.
+    params : pytree, optional
+        Any pytree of numbers, further parameters of the profile.
 
     Raises
     ------

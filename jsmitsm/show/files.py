@@ -34,22 +34,25 @@ def from_mesh(mesh: Any, tags: str | None = None) -> Cloud:
 
     Parameters
     ----------
-    mesh : a ``meshio.Mesh``, or the path of a file: SU2 and Abaqus or CalculiX (.inp), what meshio reads besides
+    mesh : meshio.Mesh or path
+        A ``meshio.Mesh``, or the path of a file: SU2 and Abaqus or CalculiX (.inp), what meshio reads besides
         (Gmsh, VTK, XDMF, ...). Lines, triangles, quadrilaterals, tetrahedra, hexahedra, wedges and pyramids, of
-        first and of second order. The cells of the highest dimension are the domain; nodes that none of them uses are
-        dropped.
-    tags : the name of the cell data that hold the groups; found by itself for Gmsh (``gmsh:physical``, names
-        from its physical groups), Medit and others, whose groups are cell sets or point sets. Or a list of the names
-        of groups: those alone, the first first.
+        first and of second order. The cells of the highest dimension are the domain; nodes that none of them uses
+        are dropped.
+    tags : str or list of str, optional
+        The name of the cell data that hold the groups; found by itself for Gmsh (``gmsh:physical``, names from its
+        physical groups), Medit and others, whose groups are cell sets or point sets. Or a list of the names of
+        groups: those alone, the first first.
 
     Returns
     -------
-    Cloud : groups ``"interior"`` and one for every tag of boundary facets and every set of boundary nodes. A node of
-        several belongs to the one named first, but a set that holds another whole comes after it, and none goes away
-        empty-handed; a boundary node of none belongs to ``"boundary"``. Normals are those of the group's
+    Cloud
+        Groups ``"interior"`` and one for every tag of boundary facets and every set of boundary nodes. A node of
+        several belongs to the one named first, but a set that holds another whole comes after it, and none goes
+        away empty-handed; a boundary node of none belongs to ``"boundary"``. Normals are those of the group's
         facets, averaged by angle: on curved sides as exact as the facets follow them (those of second order are
-        parabolas); ``cloud.replace(normals=...)`` takes better ones. What has a name and is no side (materials, lines
-        inside, sets that reach inside) is in ``cloud.cell_groups``: indices by name, which may overlap.
+        parabolas); ``cloud.replace(normals=...)`` takes better ones. What has a name and is no side (materials,
+        lines inside, sets that reach inside) is in ``cloud.cell_groups``: indices by name, which may overlap.
 
     Raises
     ------
@@ -61,6 +64,8 @@ def from_mesh(mesh: Any, tags: str | None = None) -> Cloud:
         for a domain that touches itself in a point or an edge; for a group without a node of its own, and tags that do
         not exist or name nothing. Which way round the nodes of a cell run does not matter.
 
+    Examples
+    --------
     >>> import meshio, numpy as np, jsmitsm as js
     >>> corners = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0.5, 0.5, 0]]
     >>> mesh = meshio.Mesh(corners, [("triangle", [[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]]),

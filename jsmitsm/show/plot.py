@@ -31,13 +31,24 @@ def cloud(what: Cloud | Solution, *, normals: bool = False, support: int | None 
 
     Parameters
     ----------
-    what : a :class:`jsmitsm.Cloud` or a :class:`jsmitsm.Solution`, whose cloud is taken.
-    normals : draw the boundary's normals.
-    support : a particle whose support is shown: its neighbours are ringed, and with ``kernel`` the
-        ball |x - x_i| <= d h is drawn.
-    kernel, stencils : where the support comes from; a Solution brings its own neighbours.
-    legend : name the groups and count their particles.
-    ax : axes to draw on; in 3D they need ``projection="3d"``.
+    what : Cloud or Solution
+        A ``js.Cloud`` or a ``js.Solution``, whose cloud is taken.
+    normals : bool
+        Draw the boundary's normals.
+    support : int, optional
+        A particle whose support is shown: its neighbours are ringed, and with ``kernel`` the ball |x - x_i| <= d h
+        is drawn.
+    kernel, stencils : Kernel, Stencils, optional
+        Where the support comes from; a Solution brings its own neighbours.
+    legend : bool
+        Name the groups and count their particles.
+    ax : Axes, optional
+        Axes to draw on; in 3D they need ``projection="3d"``.
+
+    Returns
+    -------
+    Axes
+        What it was drawn on.
 
     Raises
     ------
@@ -89,22 +100,30 @@ def solution(sol: Solution, *, field: int = 0, exact: Any = None, at: Mapping[st
 
     Parameters
     ----------
-    sol : a :class:`jsmitsm.Solution`.
-    field : the field of a system.
-    exact : 1D only: the exact solution to draw beside it, a function of one point x (1,).
-    at : 3D only: positions of the slices by axis, ``{"z": 0.5}``; the middle of every axis if not given.
-    levels : about how many contour levels.
-    colorbar : draw one, for 2D and 3D.
-    ax : axes; in 3D one for every slice.
+    sol : Solution
+        A ``js.Solution``.
+    field : int
+        The field of a system.
+    exact : function, optional
+        1D only: the exact solution to draw beside it, a function of one point x (1,).
+    at : mapping, optional
+        3D only: positions of the slices by axis, ``{"z": 0.5}``; the middle of every axis if not given.
+    levels : int
+        About how many contour levels.
+    colorbar : bool
+        Draw one, for 2D and 3D.
+    ax : Axes or array of Axes, optional
+        Axes; in 3D one for every slice.
+
+    Returns
+    -------
+    Axes or array of Axes
+        In 3D an array, one per slice.
 
     Raises
     ------
     ValueError
         For a field, a slice or a number of axes that does not fit.
-
-    Returns
-    -------
-    The axes; in 3D an array of them, one per slice.
 
     Examples
     --------
@@ -379,11 +398,22 @@ def convergence(spacing: Any, errors: Any, *, floor: float = 1e-13, xlabel: str 
 
     Parameters
     ----------
-    spacing : (M,) distances between particles, in any order.
-    errors : (M,) errors, or a mapping from a name to them for several lines.
-    floor : errors below it are round-off and take no part in the order, which is the slope of the
-        least-squares line through the others.
-    xlabel, ylabel : names of the axes.
+    spacing : array_like (M,)
+        (M,) distances between particles, in any order.
+    errors : array_like (M,) or mapping
+        (M,) errors, or a mapping from a name to them for several lines.
+    floor : float
+        Errors below it are round-off and take no part in the order, which is the slope of the least-squares line
+        through the others.
+    xlabel, ylabel : str
+        Names of the axes.
+    ax : Axes, optional
+        Where to draw.
+
+    Returns
+    -------
+    Axes
+        What it was drawn on.
 
     Raises
     ------

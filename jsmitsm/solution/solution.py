@@ -36,16 +36,24 @@ class Report(Protocol):
 class Solution:
     """A solution at the particles, and anywhere through local Taylor polynomials.
 
-    Attributes
-    ----------
-    u : (N,) values at the particles in the cloud's order, (N, F) for a system.
-    coefficients : (N, K) unscaled Taylor coefficients d^a u / a! at every particle, in the order
-        of :func:`jsmitsm.multi_indices`; (N, K, F) for a system. Fitted when first asked for.
-    converged : whether the solve met its tolerance; iterations : Newton steps (1 if linear).
-    stats : seconds per phase, sizes, what was skipped or repaired.
 
     ``sol(points)`` evaluates it at points (M, D), ``sol.grad(points)`` its gradient.
+
     A solution is a pytree: it passes through ``jax.jit``, ``jax.grad`` and ``pickle``.
+
+    Attributes
+    ----------
+    u : array (N,) or (N, F)
+        (N,) values at the particles in the cloud's order, (N, F) for a system.
+    coefficients : array (N, K) or (N, K, F)
+        (N, K) unscaled Taylor coefficients d^a u / a! at every particle, in the order of
+        ``js.multi_indices``; (N, K, F) for a system. Fitted when first asked for.
+    converged : bool
+        Whether the solve met its tolerance.
+    iterations : int
+        Newton steps (1 if linear).
+    stats : dict
+        Seconds per phase, sizes, what was skipped or repaired.
 
     Examples
     --------
@@ -109,7 +117,7 @@ class Solution:
 
     @property
     def coefficients(self) -> Array:
-        """Taylor coefficients d^a u / a!, (N, K), ordered as :func:`jsmitsm.multi_indices`; (N, K, F) for a system."""
+        """Taylor coefficients d^a u / a!, (N, K), ordered as ``js.multi_indices``; (N, K, F) for a system."""
         fitted = self._taylor
         return fitted[:, 0] if self._recipe.fields == 1 else jnp.swapaxes(fitted, 1, 2)
 
@@ -132,7 +140,7 @@ class Solution:
 
         outside : what becomes of points outside of the domain and in its holes: "nan", "raise" (ValueError), or
             "extrapolate", with the polynomial of the particle nearest to them. Points up to half the local spacing
-            outside count as inside. The particles tell what is inside (:mod:`jsmitsm.cloud.inside`); where all of a
+            outside count as inside. The particles tell what is inside (``jsmitsm.cloud.inside``); where all of a
             cloud's points are traced by jax.jit or jax.vmap nothing is known of them, and everything counts as inside.
 
         Raises ValueError for points of another shape, NaN or infinite ones.

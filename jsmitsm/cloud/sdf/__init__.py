@@ -2,7 +2,7 @@
 
 Every function here returns a function ``x (D,) -> scalar``, negative inside, zero on the boundary,
 positive outside, written in ``jax.numpy``: it can be mapped, differentiated and handed to
-:func:`jsmitsm.from_sdf`. Centres, lengths and angles may be traced values. Gradients are finite
+``js.from_sdf``. Centres, lengths and angles may be traced values. Gradients are finite
 everywhere but where a docstring says otherwise, also where a plain norm would give NaN.
 
 The formulas are those of Quilez, "2D / 3D distance functions" (iquilezles.org/articles), rewritten

@@ -21,12 +21,14 @@ from jsmitsm.solution.solution import Solution
 
 @jax.tree_util.register_pytree_node_class
 class RegionsSolution(Solution):
-    """A solution in several regions: a :class:`jsmitsm.Solution` whose values jump where the problem says so.
+    """A solution in several regions: a ``js.Solution`` whose values jump where the problem says so.
 
     ``sol(points)`` takes the region in which each point lies, as the particles of the interfaces tell;
     ``sol(points, region="a")`` the expansions of that region, on the interface its side of it. ``sol.region("a")`` is
     the solution of one region alone. Integrals and fluxes over an interface ``"a|b"`` take the side ``region``.
 
+    Examples
+    --------
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jsmitsm as js
     >>> cloud = js.regions({"a": (0.0, 0.5), "b": (0.5, 1.0)}, spacing=0.125)
