@@ -51,20 +51,20 @@ def quality(cloud: Cloud, spacing: filling.SpacingLike | None = None) -> Quality
     Parameters
     ----------
     cloud : Cloud
-        A ``js.Cloud``. With normals the boundary is told exactly; without them the domain is taken to be convex.
-        Of several regions the worst of each measure counts.
+        With normals the boundary is told exactly; without them the domain is taken to be convex. Of several regions
+        the worst of each measure counts.
     spacing : float or function, optional
         A number or a function (M, D) -> (M,); by default the mean nearest distance near each particle.
 
     Returns
     -------
-    Quality, a named tuple: ``fill`` the radius of the largest empty ball in the domain over the local spacing
-    (0.58 for hexagons), ``separation`` the smallest distance of a pair over the local spacing (1 for any lattice),
-    ``mesh_ratio`` = fill / (separation / 2) (1.15 for hexagons, below 2 is even, above 4 is poor), ``evenness``
-    the least over the mean nearest distance, in local spacings; ``fill_distance`` and ``separation_distance`` the
-    first two in length units (Wendland, Scattered Data Approximation, 2005, has half the latter).
+    Quality
+        A named tuple.
 
-    Raises ValueError for fewer than D + 2 particles, and normals that point inward.
+    Raises
+    ------
+    ValueError
+        For fewer than D + 2 particles, and normals that point inward.
 
     Examples
     --------

@@ -133,17 +133,42 @@ class Solution:
         return self._fitted
 
     def __call__(self, points: ArrayLike, *, blend: bool = False, outside: str = "nan") -> jax.Array:
-        """Values (M,) at ``points`` (M, D), (M, F) for a system.
+        """Values anywhere, from the local Taylor polynomials.
 
         Each point takes the polynomial of its nearest particle, or with ``blend`` a smooth average
         of those of its nearest few, which is continuous across the cloud.
 
-        outside : what becomes of points outside of the domain and in its holes: "nan", "raise" (ValueError), or
-            "extrapolate", with the polynomial of the particle nearest to them. Points up to half the local spacing
-            outside count as inside. The particles tell what is inside (``jsmitsm.cloud.inside``); where all of a
-            cloud's points are traced by jax.jit or jax.vmap nothing is known of them, and everything counts as inside.
+        Parameters
+        ----------
+        points : array_like (M, D)
+            Where.
+        blend : bool
+            Average the polynomials of the nearest few particles.
+        outside : {"nan", "raise", "extrapolate"}
+            What becomes of points outside of the domain and in its holes: NaN, a ValueError, or the polynomial of
+            the particle nearest to them. Points up to half the local spacing outside count as inside. The particles
+            tell what is inside; where all of a cloud's points are traced by jax.jit or jax.vmap nothing is known of
+            them, and everything counts as inside.
 
-        Raises ValueError for points of another shape, NaN or infinite ones.
+        Returns
+        -------
+        jax.Array
+            (M,), for a system (M, F).
+
+        Raises
+        ------
+        ValueError
+            For points of another shape, NaN or infinite ones.
+
+        Examples
+        --------
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import jsmitsm as js
+        >>> ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(1.0)}
+        >>> problem = js.Problem(lambda u, x: js.laplacian(u)(x) - 6 * x[0], ends)  # x^3
+        >>> sol = js.solve(problem, js.interval(0.0, 1.0, 9))
+        >>> round(float(sol([[0.5]])[0]), 9)
+        0.125
         """
         return self.derivative(points, (0,) * self.cloud.dim, blend=blend, outside=outside)
 

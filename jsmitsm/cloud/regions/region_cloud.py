@@ -71,7 +71,29 @@ class RegionCloud(Cloud):
         return self._spacing
 
     def region(self, name: str) -> Cloud:
-        """The cloud of one region: its particles in their order, with outward normals. ValueError for other names."""
+        """The cloud of one region: its particles in their order, with outward normals.
+
+        Parameters
+        ----------
+        name : str
+            Of the region.
+
+        Returns
+        -------
+        Cloud
+            Its groups those of the boundary and the interfaces that it touches.
+
+        Raises
+        ------
+        ValueError
+            For other names.
+
+        Examples
+        --------
+        >>> import jsmitsm as js
+        >>> len(js.regions({"a": (0.0, 0.5), "b": (0.5, 1.0)}, spacing=0.125).region("a"))
+        5
+        """
         if name not in self.regions:
             known = list(self.regions)
             raise ValueError(f"region: {name!r} is none of the cloud's, {known}{did_you_mean(name, known)}")
@@ -90,7 +112,30 @@ class RegionCloud(Cloud):
         return new
 
     def replace(self, points: ArrayLike | None = None, normals: ArrayLike | None = None) -> Cloud:
-        """The same groups with other points or normals (traced values welcome); copies move together."""
+        """The same groups with other points or normals (traced values welcome); copies move together.
+
+        Parameters
+        ----------
+        points, normals : array_like (N, D), optional
+            What is replaced.
+
+        Returns
+        -------
+        RegionCloud
+            A new one; this one stays.
+
+        Raises
+        ------
+        ValueError
+            For another number of particles.
+
+        Examples
+        --------
+        >>> import jsmitsm as js
+        >>> layers = js.regions({"a": (0.0, 0.5), "b": (0.5, 1.0)}, spacing=0.125)
+        >>> layers.replace(points=2 * layers.points).spacing
+        0.25
+        """
         new = object.__new__(RegionCloud)
         if points is not None and np.shape(points) != self.points.shape:
             raise ValueError(

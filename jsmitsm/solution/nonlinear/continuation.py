@@ -60,16 +60,20 @@ def continuation(
     ----------
     problem : function
         Of one number; returns the problem to solve.
+    cloud : Cloud
+        The particles it is solved on.
     parameters : sequence of float
         The stages, in the order in which to go; two or more.
     u0 : array_like or function, optional
-        Start of the first stage, as in ``js.solve``; ``options`` are passed to it.
+        Start of the first stage, as in ``js.solve``.
     arclength : bool
         Follow the branch of solutions by its arc length (Keller 1977), which passes turning points. The second
         parameter says in which direction to set out, and each is that at which the branch passes it after the one
         before: [1.0, 2.0, 2.0] are the solutions at 2 before the turning point and behind it.
     steps : int
         With ``arclength``, the most steps along the branch; it ends there, or where the last parameter was passed.
+    **options : optional
+        Passed to ``js.solve``.
 
     Returns
     -------
