@@ -15,13 +15,15 @@ from jsmitsm.modes.estimate import errors
 from jsmitsm.modes.question import Question, mass_at
 from jsmitsm.modes.spectrum import Pairs
 from jsmitsm.runtime.arrays import Array, ArrayLike
-from jsmitsm.runtime.errors import short
+from jsmitsm.runtime.errors import short, some
 from jsmitsm.runtime.tracers import frozen, is_traced, owned
 from jsmitsm.solution.fit import Fit, Recipe
 from jsmitsm.solution.solution import Solution
 
 # An estimated error above this part of the value is a flag; of values near zero, of this part of the largest.
 LARGE, SMALL = 0.02, 0.01
+# A condition number of a value above this says that the operator is far from self-adjoint.
+LOOSE = 1e3
 
 
 @jax.tree_util.register_pytree_node_class
@@ -163,18 +165,43 @@ class Modes:
         """
         if not is_traced(self.converged) and not np.all(self.converged):
             return ["The values were not found."]
-        error, values = self.error_estimate(), np.asarray(self._values)
-        size = np.maximum(np.abs(values), SMALL * np.abs(values).max(initial=0.0))
-        part = error / np.where(size > 0, size, 1.0)
+        error, part = self.error_estimate(), self._part()
         out = []
         if np.isinf(error).any():
             out.append("There is no error estimate: the cloud has too few particles for expansions of another order.")
-        for k in np.flatnonzero(np.isfinite(part) & (part > LARGE)):
+        bad = np.flatnonzero(np.isfinite(part) & (part > LARGE))
+        if len(bad):
             out.append(
-                f"Mode {k} is not resolved, or spurious: the estimated error is {part[k]:.0%} of its value "
-                f"{values[k]:.6g}; refine the cloud, or raise the order."
+                f"{len(bad)} of {len(part)} modes, {some(bad)}, are not resolved, or spurious: their estimated errors "
+                f"are up to {part[bad].max():.0%} of their values; refine the cloud, or raise the order."
+            )
+        short_waves = np.setdiff1d(np.flatnonzero(np.abs(self._values) > self._known("flags").highest()), bad)
+        if len(short_waves):
+            out.append(
+                f"{len(short_waves)} of {len(part)} modes, {some(short_waves)}, have waves shorter than four "
+                "particles, which the cloud does not resolve: refine it, or ask for fewer."
+            )
+        loose = np.setdiff1d(np.flatnonzero(self._conditions() > LOOSE), bad)
+        if len(loose):
+            out.append(
+                f"{len(loose)} of {len(part)} values, {some(loose)}, feel small errors {self._conditions().max():.0e} "
+                "times, since the operator is far from self-adjoint, as strong convection makes it: the error estimate "
+                "says little; write u = exp(b . x / 2) v for a drift b, or compare with a finer cloud."
             )
         return out
+
+    def _conditions(self) -> np.ndarray:
+        """The condition numbers (k,) of the values: the sizes of both vectors where their product is one."""
+        found, q = self._host("flags"), self._known("flags")
+        weighted = np.asarray(q.weights).reshape(-1)[q.pencil.free][:, None]
+        dual = weighted * (q.pencil.B.to_scipy()[q.pencil.free][:, q.pencil.free].T @ found.left)
+        return np.linalg.norm(found.right, axis=0) * np.linalg.norm(dual, axis=0)
+
+    def _part(self) -> np.ndarray:
+        """The estimated errors (k,) relative to the values, or to a part of the largest, where those are small."""
+        values = np.abs(self._values)
+        size = np.maximum(values, SMALL * values.max(initial=0.0))
+        return self.error_estimate() / np.where(size > 0, size, 1.0)
 
     def diagnose(self) -> str:
         """In words: how well the values are known, which are multiple, and what was repaired."""
@@ -192,8 +219,7 @@ class Modes:
                 )
         if np.iscomplexobj(self._values):
             lines.append("Some values are complex by more than their error: the operator is not self-adjoint.")
-        part = self.error_estimate() / np.maximum(np.abs(self._values), 1e-300)
-        lines.append(f"The estimated errors are up to {part.max():.1e} of the values.")
+        lines.append(f"The estimated errors are up to {self._part().max():.1e} of the values.")
         lines.append(f"The largest residual is {self.residuals.max():.1e}.")
         fitness = q.pencil.layout.fitness
         if fitness is not None:

@@ -33,6 +33,19 @@ class Question:
     massed: np.ndarray
     other: Pencil | None = None  # of another order, once an error was estimated
 
+    def highest(self) -> float:
+        """The value, about, of a wave of four particles: beyond it nothing is resolved."""
+        disc = self.pencil.layout.disc
+        jac, _ = disc.traced.coefficients(disc.cloud.points, 0, params=disc.problem.params)
+        number = 0.5 * np.pi / mean_spacing(disc)
+        out = np.inf
+        for e in np.flatnonzero(self.massed):
+            m = disc.traced.order[e]
+            lead = [s for s, (_, b) in enumerate(disc.rec.slots) if sum(b) == m]
+            size = float(np.median(np.abs(np.asarray(jac)[e, lead, 0]).max(axis=0)))
+            out = min(out, size * number**m / float(np.abs(self.weights[:, e]).max()))
+        return out
+
 
 def reduced(pencil: Pencil, weights: Any) -> tuple[Pattern, Any, Any]:
     """The pencil over the free unknowns alone: the places of its entries, those of A, and those of B mass."""
