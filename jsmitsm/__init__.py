@@ -18,11 +18,11 @@ __version__ = "0.2.0"
 
 __all__ = [
     "Cloud", "Condition", "Constant", "CubicSpline", "Factorization", "Formulation", "Gaussian", "Kernel", "Method",
-    "Problem", "Quality", "Solution", "SolveError", "Solver", "Stencils", "SuperGaussian", "TuneResult", "Wendland",
-    "box", "condition", "continuation", "dirichlet", "divergence", "factorize", "files", "fix", "free", "from_polygon",
-    "from_sdf", "grad", "hessian", "interface", "interval", "laplacian", "meant", "multi_indices", "neumann",
-    "no_progress", "partial", "periodic", "plot", "quadrature", "quality", "rectangle", "regions", "robin", "sdf",
-    "show_versions", "solve", "stencils", "tune",
+    "Modes", "Problem", "Quality", "Solution", "SolveError", "Solver", "Stencils", "SuperGaussian", "TuneResult",
+    "Wendland", "box", "condition", "continuation", "dirichlet", "divergence", "eigen", "factorize", "files", "fix",
+    "free", "from_polygon", "from_sdf", "grad", "hessian", "interface", "interval", "laplacian", "meant",
+    "multi_indices", "neumann", "no_progress", "partial", "periodic", "plot", "quadrature", "quality", "rectangle",
+    "regions", "robin", "sdf", "show_versions", "solve", "stencils", "tune",
 ]  # fmt: skip
 
 # Imported when first used, the solver too: who draws or makes clouds need not wait for it. Where each stands is said
@@ -34,6 +34,8 @@ if TYPE_CHECKING:
     from jsmitsm.cloud.regions.making import regions
     from jsmitsm.cloud.shapes import from_polygon, from_sdf
     from jsmitsm.linear.linsolve import Solver
+    from jsmitsm.modes.eigen import eigen
+    from jsmitsm.modes.modes import Modes
     from jsmitsm.runtime.versions import show_versions
     from jsmitsm.show import files, plot
     from jsmitsm.solution.arguments import Formulation, Method
@@ -47,11 +49,13 @@ else:
         "Factorization": "solution.factorization",
         "Formulation": "solution.arguments",
         "Method": "solution.arguments",
+        "Modes": "modes.modes",
         "Quality": "cloud.quality",
         "Solution": "solution.solution",
         "Solver": "linear.linsolve",
         "TuneResult": "tuning.tune",
         "continuation": "solution.nonlinear.continuation",
+        "eigen": "modes.eigen",
         "factorize": "solution.factorization",
         "files": "show",
         "from_polygon": "cloud.shapes",
