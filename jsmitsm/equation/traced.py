@@ -105,6 +105,11 @@ class Traced:
             return jac, None
         return jac, self._compute(inputs, degree, False, True)[1]
 
+    def residuals(self, points: Any, *, params: Any = None, slots: Any = None) -> Any:
+        """The residual alone (E, N) at the points, where the slots' derivatives are ``slots`` (S, N) or zero."""
+        inputs = self._inputs(points, 0, (), params, None if slots is None else slots[:, None])
+        return self._compute(inputs, 0, False, True)[1][:, 0]
+
     def with_any_numbers(self) -> Traced:
         """The same with some numbers for the constants that are only traced."""
         return replace(self, _record=self._record._replace(consts=tuple(map(any_number, self._record.consts))))
