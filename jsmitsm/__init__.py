@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 from jsmitsm.cloud.cloud import Cloud, box, interval, rectangle
 from jsmitsm.cloud.neighbours import Stencils, stencils
 from jsmitsm.equation.marks import meant
-from jsmitsm.equation.operators import divergence, grad, hessian, laplacian, partial
+from jsmitsm.equation.operators import divergence, dt, grad, hessian, laplacian, partial
 from jsmitsm.equation.problem import Condition, Problem, condition, dirichlet, fix, free, neumann, periodic, robin
 from jsmitsm.particle.kernels import Constant, CubicSpline, Gaussian, Kernel, SuperGaussian, Wendland
 from jsmitsm.runtime.errors import SolveError, did_you_mean
@@ -16,9 +16,9 @@ from jsmitsm.taylor.multi_indices import multi_indices
 __version__ = "0.2.0"
 
 __all__ = [
-    "Cloud", "Condition", "Constant", "CubicSpline", "Factorization", "Formulation", "Gaussian", "Kernel", "Method",
+    "Cloud", "Condition", "Constant", "CubicSpline", "Evolution", "Factorization", "Formulation", "Gaussian", "Kernel", "Method",
     "Problem", "Quality", "Solution", "SolveError", "Solver", "Stencils", "SuperGaussian", "TuneResult", "Wendland",
-    "box", "condition", "continuation", "dirichlet", "divergence", "factorize", "files", "fix", "free", "from_polygon",
+    "box", "condition", "continuation", "dirichlet", "divergence", "dt", "evolve", "factorize", "files", "fix", "free", "from_polygon",
     "from_sdf", "grad", "hessian", "interval", "laplacian", "meant", "multi_indices", "neumann", "no_progress",
     "partial", "periodic", "plot", "quadrature", "quality", "rectangle", "robin", "sdf", "show_versions", "solve",
     "stencils", "tune",
@@ -31,6 +31,8 @@ if TYPE_CHECKING:
     from jsmitsm.cloud.quadrature import quadrature
     from jsmitsm.cloud.quality import Quality, quality
     from jsmitsm.cloud.shapes import from_polygon, from_sdf
+    from jsmitsm.evolution.evolution import Evolution
+    from jsmitsm.evolution.evolve import evolve
     from jsmitsm.linear.linsolve import Solver
     from jsmitsm.runtime.versions import show_versions
     from jsmitsm.show import files, plot
@@ -42,6 +44,7 @@ if TYPE_CHECKING:
     from jsmitsm.tuning.tune import TuneResult, tune
 else:
     _LAZY = {
+        "Evolution": "evolution.evolution",
         "Factorization": "solution.factorization",
         "Formulation": "solution.arguments",
         "Method": "solution.arguments",
@@ -50,6 +53,7 @@ else:
         "Solver": "linear.linsolve",
         "TuneResult": "tuning.tune",
         "continuation": "solution.nonlinear.continuation",
+        "evolve": "evolution.evolve",
         "factorize": "solution.factorization",
         "files": "show",
         "from_polygon": "cloud.shapes",

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 # Steps that a polynomial goes through; its error is of their number's power of the step.
@@ -26,3 +28,15 @@ def weights(nodes: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarra
     hit = abs(at[np.arange(len(x)), near] - x[:, 0]) <= 1e-13
     out[hit] = np.arange(k) == near[hit, None]
     return index, out
+
+
+def derivative(nodes: np.ndarray, values: np.ndarray, time: float, order: int) -> np.ndarray:
+    """The derivative of this order of the polynomial through the nearest steps: values (K, ...) to (...)."""
+    (index,), _ = weights(nodes, np.array([time]))
+    scale = float(nodes[index[-1]] - nodes[index[0]])
+    s = (nodes[index] - time) / scale
+    # Coefficients of the polynomial about the time itself.
+    taylor = np.tensordot(np.linalg.inv(s[:, None] ** np.arange(len(s))), values[index], axes=1)
+    if order >= len(s):
+        return np.zeros(values.shape[1:])
+    return taylor[order] * math.factorial(order) / scale**order
