@@ -45,11 +45,11 @@ class History:
         self.scale = max(self.scale, float(np.abs(part).max(initial=0.0)))
         if self.wanted is not None and number is not None and not self.wanted[number]:
             return
-        sample = semi.sample(np.asarray(float(t)))
         self.times.append(t)
-        self.states.append(semi.placed(part, np.asarray(sample[0])))
+        self.states.append(semi.placed(part, step.known))
         if semi.second:
-            self.rates.append(semi.placed(step.y[semi.system.n :], np.asarray(sample[3])))
+            rates = semi.sample(np.asarray(float(t)))[3]
+            self.rates.append(semi.placed(step.y[semi.system.n :], np.asarray(rates)))
 
     def at(self, times: np.ndarray, of: list[np.ndarray]) -> np.ndarray:
         index, weights = dense_output.weights(np.array(self.times), times)
@@ -102,8 +102,9 @@ def started(run: Run, h: float) -> np.ndarray:
 
 
 def _now(run: Run, t: float) -> tuple[np.ndarray, np.ndarray]:
-    force, held = run.semi.forces(*run.semi.samples(np.array([t])))
-    explicit = 0.0 if run.semi.linear else run.semi.explicit(started_raw(run), t)
+    samples = run.semi.samples(np.array([t]))
+    force, held = run.semi.forces(*samples)
+    explicit = 0.0 if run.semi.linear else run.semi.explicit(started_raw(run), t, samples[0][:, 0])
     return force[0] + explicit, held[0]
 
 
@@ -116,6 +117,7 @@ def _equal(run: Run, y: np.ndarray, times: np.ndarray, history: History, shown: 
     """Equal steps; the estimated errors of some of them, relative to the solution."""
     h = float(times[-1] - times[0]) / (len(times) - 1)
     stepper = run.stepper(run.semi)
+    stepper.drive.plan(times[:-1], h)
     step = stepper.first(y, float(times[0]))
     history.add(float(times[0]), step, 0)
     looks = {round(k) for k in np.linspace(0, len(times) - 2, LOOKS)}

@@ -27,16 +27,16 @@ class Newton:
         self._g = 0.0
         self.counts = {"iterations": 0, "factorisations": 0}
 
-    def __call__(self, r: np.ndarray, guess: np.ndarray, t: float, g: float) -> np.ndarray:
+    def __call__(self, r: np.ndarray, guess: np.ndarray, t: float, g: float, known: np.ndarray) -> np.ndarray:
         semi, y = self.semi, guess
         before, fresh = np.inf, False
         for _ in range(MOST):
             with np.errstate(all="ignore"):
-                misfit = semi.system.mass(y) + g * (semi.system.stiff(y) - semi.explicit(y, t)) - r
+                misfit = semi.system.mass(y) + g * (semi.system.stiff(y) - semi.explicit(y, t, known)) - r
             if not np.isfinite(misfit).all():
                 break
             if self._factor is None or g != self._g:
-                self._prepare(y, t, g)
+                self._prepare(y, t, g, known)
                 fresh = True
             change = self._factor.solve(misfit)
             y = y - change
@@ -53,10 +53,10 @@ class Newton:
             "or a tol instead of steps"
         )
 
-    def _prepare(self, y: np.ndarray, t: float, g: float) -> None:
+    def _prepare(self, y: np.ndarray, t: float, g: float, known: np.ndarray) -> None:
         semi = self.semi
         system = semi.system
-        extra = (g * semi.linearised(semi.steepness(semi.lifted(y, np.asarray(float(t))), t))).tocoo()
+        extra = (g * semi.linearised(semi.steepness(semi.placed(y, known), t))).tocoo()
         parts = [(1.0, system.masses[0]), (g, system.stiffness),
                  (1.0, Sparse(extra.data, *extra.coords, extra.shape))]  # fmt: skip
         values = np.concatenate([f * np.asarray(m.values) for f, m in parts])

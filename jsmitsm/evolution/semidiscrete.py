@@ -21,6 +21,9 @@ from jsmitsm.runtime.collector import uncollected
 from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.taylor.multi_indices import count
 
+# Steps from which on those to come are looked at together, and the numbers that this may take at a time.
+MANY, NUMBERS = 64, 4e6
+
 
 class Semidiscrete:
     """The equations of the free values, what drives them, and the way back to all values.
@@ -38,8 +41,10 @@ class Semidiscrete:
         whole = lambda m: Sparse(m.values, m.rows, m.cols, m.shape)  # noqa: E731
         stiff, source, given = (whole(m) for m in (pencil.A, pencil.B, pencil.Bg))
         masses = [self._times_mass(source, j) for j in ((1, 2) if self.second else (1,))]
-        if damping:
-            masses[0] = _sum(masses[0], self._damping(masses[-1], damping))
+        if damping and self.second:
+            masses[0] = _sum(masses[0], self._damping(masses[1], damping))
+        elif damping:
+            stiff = _sum(stiff, self._damping(masses[0], damping))
         every = np.arange(self.n * self.fields)
         self.system = System(
             stiff.part(self.free, self.free), tuple(m.part(self.free, self.free) for m in masses), self.places
@@ -59,6 +64,18 @@ class Semidiscrete:
     def linear(self) -> bool:
         """Whether nothing is left of N but a source."""
         return not self.rest.slots
+
+    @cached_property
+    def apart(self) -> bool:
+        """Whether N at u = 0 is a source, taken apart from N: implicitly, and so with more of the scheme's order."""
+        if self.linear:
+            return True
+        if is_traced(self.points, self.params):
+            return False
+        with np.errstate(all="ignore"):
+            slots = np.zeros((len(self.rest.slots), self.n))
+            found = self.rest.residuals(self.points, params=(np.asarray(0.0), self.params), slots=slots)
+        return bool(np.isfinite(found).all())
 
     @property
     def points(self) -> Any:
@@ -116,8 +133,9 @@ class Semidiscrete:
         xp = jnp if is_traced(values, given, gamma) else np
         conditions = xp.concatenate([xp.asarray(given).reshape(-1), xp.asarray(gamma).reshape(-1)])
         source = np.zeros(self.n * self.fields)
-        if self.linear and self.timed.rest.source != "zero":
-            found = self.timed.rest.residuals(self.points, params=problem.params)
+        if self.apart and self.timed.rest.source != "zero":
+            slots = None if self.linear else np.zeros((len(self.rest.slots), self.n))
+            found = self.rest.residuals(self.points, params=problem.params, slots=slots)
             source = (jnp if is_traced(found) else np).broadcast_to(found, (self.fields, self.n)).T.reshape(-1)
         held = xp.asarray(values).reshape(-1)[self.held]
         return (held, conditions, source, *self._rates(t)) if self.second else (held, conditions, source)
@@ -144,6 +162,10 @@ class Semidiscrete:
             return [np.broadcast_to(np.asarray(v)[:, None], (len(v), len(times))) for v in self._still]
         found = [self.sample(np.asarray(float(t))) for t in times]
         return [np.stack([np.asarray(v) for v in column], axis=-1) for column in zip(*found)]
+
+    def many_samples(self, times: np.ndarray) -> list[np.ndarray]:
+        """The same, by one program."""
+        return [np.moveaxis(np.asarray(v), 0, -1) for v in jax.vmap(self.sample)(jnp.asarray(times))]
 
     def forces(self, held: Any, conditions: Any, source: Any, *rates: Any) -> tuple[Any, Any]:
         """F and H (m, size) from samples, moments last."""
@@ -199,6 +221,8 @@ class Semidiscrete:
         """N (N F,) from its slots' derivatives (S, N)."""
         found = self.rest.residuals(self.points, params=(t, params), slots=slots)
         xp = jnp if is_traced(found, slots) else np
+        if self.apart:
+            found = found - self.rest.residuals(self.points, params=(t, params), slots=np.zeros(slots.shape))
         found = xp.broadcast_to(found, (self.fields, self.n))
         if self.reference is not None:
             found = found - xp.einsum("esn,sn->en", self.reference, slots)
@@ -232,35 +256,66 @@ class Semidiscrete:
         whole = sparse.csr_array((values, (rows, lender[cols])), shape=(size, size))
         return self.source.host @ whole[:, self.free]
 
-    def explicit(self, y: Any, t: Any) -> Any:
-        """-B N on the equations of a state."""
+    def explicit(self, y: Any, t: Any, known: Any) -> Any:
+        """-B N on the equations of a state, given the held values."""
         t = t if is_traced(t) else np.asarray(float(t))
-        u = self.lifted(y, t)
+        u = self.placed(y[: self.system.n], known)
         return self.system.force(-self.source.times(self.nonlinear(self.slot_values(u), t, self.params)))
 
 
 class Driver:
-    """What drives a system in the stages of one scheme; the end of a step is not looked at again."""
+    """What drives a system in the stages of one scheme.
+
+    Samples at the end of a step serve the next. Where the steps are known (``plan``) those of many are made at once, by
+    one compiled program.
+    """
 
     def __init__(self, semi: Semidiscrete, sampling: Sampling):
         self.semi, self.sampling = semi, sampling
         self._last: tuple[float, list[Any]] | None = None
+        self._starts, self._h, self._block = np.zeros(0), 0.0, (0, 0, [])
 
-    def start(self, t: float) -> tuple[Any, Any]:
+    def plan(self, starts: np.ndarray, h: float) -> None:
+        """Steps to come, of one size."""
+        if not self.semi.timed.steady and len(starts) >= MANY:
+            self._starts, self._h = starts, h
+
+    def start(self, t: float) -> tuple[Any, Any, Any]:
         samples = self.semi.samples(np.array([t]))
         self._last = t, samples
         force, held = self.semi.forces(*samples)
-        return force[0], held[0]
+        return force[0], held[0], samples[0][:, 0]
 
-    def step(self, t: float, h: float) -> tuple[Any, Any]:
-        semi, nodes = self.semi, t + h * self.sampling.nodes
-        if self._last is not None and self._last[0] == t:
-            rest = semi.samples(nodes[1:])
-            samples = [np.concatenate([a[:, -1:], b], axis=1) for a, b in zip(self._last[1], rest)]
-        else:
-            samples = semi.samples(nodes)
+    def step(self, t: float, h: float) -> tuple[Any, Any, Any]:
+        samples = self._samples(t, h)
         self._last = t + h, [v[:, -1:] for v in samples]
-        return semi.forces(*semi.blended(self.sampling, samples))
+        force, held = self.semi.forces(*self.semi.blended(self.sampling, samples))
+        return force, held, samples[0][:, self.sampling.stages].T
+
+    def _samples(self, t: float, h: float) -> list[Any]:
+        semi, nodes = self.semi, self.sampling.nodes
+        k = int(np.searchsorted(self._starts, t))
+        if k < len(self._starts) and self._starts[k] == t and h == self._h:
+            return self._from_block(k)
+        if self._last is not None and self._last[0] == t:
+            rest = semi.samples(t + h * nodes[1:])
+            return [np.concatenate([a[:, -1:], b], axis=1) for a, b in zip(self._last[1], rest)]
+        return semi.samples(t + h * nodes)
+
+    def _from_block(self, k: int) -> list[Any]:
+        first, end, block = self._block
+        m = len(self.sampling.nodes) - 1
+        if not first <= k < end:
+            width = self.semi.n * self.semi.fields + len(self.semi.held)
+            size = max(1, min(MANY, int(NUMBERS / (width * m))))
+            some = self._starts[np.minimum(np.arange(k, k + size), len(self._starts) - 1)]  # one shape, one program
+            times = (some[:, None] + self._h * self.sampling.nodes[:-1]).reshape(-1)
+            block = self.semi.many_samples(np.append(times, some[-1] + self._h))
+            first, end, self._block = k, k + size, (k, min(k + size, len(self._starts)), block)
+        at = (k - first) * m
+        last = k == len(self._starts) - 1
+        index = np.append(np.arange(at, at + m), block[0].shape[1] - 1 if last else at + m)
+        return [v[:, index] for v in block]
 
 
 def local_fits(disc: Any, degree: int, alone: bool = False) -> LocalFits:

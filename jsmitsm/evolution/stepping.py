@@ -18,22 +18,21 @@ import numpy as np
 
 from jsmitsm.evolution.system import System
 from jsmitsm.evolution.tableaux import RADAU, Additive
-from jsmitsm.runtime.errors import SolveError
 
 
 
 class Drive(Protocol):
-    """What drives a system: forces F and the held values' part of E, H."""
+    """What drives a system: forces F, the held values' part of E, H, and the held values themselves."""
 
-    def start(self, t: float) -> tuple[Any, Any]:
-        """At a moment, (size,) each."""
+    def start(self, t: float) -> tuple[Any, Any, Any]:
+        """At a moment: (size,), (size,), (held,)."""
 
-    def step(self, t: float, h: float) -> tuple[Any, Any]:
-        """At the implicit stages of a step, (s, size) each."""
+    def step(self, t: float, h: float) -> tuple[Any, Any, Any]:
+        """At the implicit stages of a step: (s, size), (s, size), (s, held)."""
 
 
-# What is added explicitly, -B N: (state, time) -> (size,).
-Explicit = Callable[[Any, float], Any]
+# What is added explicitly, -B N: (state, time, held values) -> (size,).
+Explicit = Callable[[Any, float, Any], Any]
 
 
 class Stopped(Exception):
@@ -47,6 +46,7 @@ class Step:
     y: np.ndarray
     force: np.ndarray  # F and H at the end
     held: np.ndarray
+    known: np.ndarray  # the held values
     slope: np.ndarray  # P at the end
     pushed: Any  # Q at the end
     stages: list[np.ndarray] = field(default_factory=list)
@@ -68,21 +68,20 @@ class Stepper:
 
     def first(self, y: np.ndarray, t: float) -> Step:
         """The start: forces and slopes there."""
-        force, held = self.drive.start(t)
-        return self._ended(y, t, force, held)
+        return self._ended(y, t, *self.drive.start(t))
 
-    def _ended(self, y: np.ndarray, t: float, force: Any, held: Any) -> Step:
+    def _ended(self, y: np.ndarray, t: float, force: Any, held: Any, known: Any) -> Step:
         slope = force - self.system.stiff(y)
-        pushed = None if self.explicit is None else self.explicit(y, t)
+        pushed = None if self.explicit is None else self.explicit(y, t, known)
         if pushed is not None and self.newton is not None:
             slope, pushed = slope + pushed, None
         slope[self.still] = 0.0  # these hold at every stage anew, whatever the start was
-        return Step(y, force, held, slope, pushed)
+        return Step(y, force, held, known, slope, pushed)
 
     def advance(self, last: Step, t: float, h: float, estimate: bool = False) -> Step:
         s, system = self.scheme, self.system
         resolvent = system.resolvent(h * s.gamma)
-        force, held = self.drive.step(t, h)
+        force, held, known = self.drive.step(t, h)
         base = system.mass(last.y) + last.held
         slopes, pushes, stages = [last.slope], [last.pushed], []
         now = last
@@ -96,9 +95,9 @@ class Stepper:
             if self.newton is None:
                 y = resolvent.solve(r)
             else:
-                y = self.newton(r, now.y, at, h * s.gamma)
+                y = self.newton(r, now.y, at, h * s.gamma, known[i - 1])
             _refuse_blown(y, at)
-            now = self._ended(y, at, force[i - 1], held[i - 1])
+            now = self._ended(y, at, force[i - 1], held[i - 1], known[i - 1])
             stages.append(y)
             slopes.append(now.slope)
             pushes.append(now.pushed)
@@ -120,16 +119,16 @@ class RadauStepper:
         self.still = system.undriven()
 
     def first(self, y: np.ndarray, t: float) -> Step:
-        force, held = self.drive.start(t)
+        force, held, known = self.drive.start(t)
         slope = force - self.system.stiff(y)
         slope[self.still] = 0.0
-        return Step(y, force, held, slope, None)
+        return Step(y, force, held, known, slope, None)
 
     def advance(self, last: Step, t: float, h: float, estimate: bool = False) -> Step:
         """With Z_i = Y_i - y:  E Z_i + H_i - H = h sum_j a_ij (F_j - A Y_j), decoupled by the eigenvectors."""
         r, system = RADAU, self.system
         real, pair = float(r.values[0].real), complex(r.values[1])
-        force, held = self.drive.step(t, h)
+        force, held, known = self.drive.step(t, h)
         jumps = held - last.held
         stiff = force - system.stiff(last.y)
         # (inverse(a) / h) (E Z + jumps) + A Z = F - A y, in the coordinates of the eigenvectors
@@ -142,7 +141,7 @@ class RadauStepper:
         _refuse_blown(y, t + h)
         slope = force[-1] - system.stiff(y)
         slope[self.still] = 0.0
-        now = Step(y, force[-1], held[-1], slope, None, [last.y + v for v in z])
+        now = Step(y, force[-1], held[-1], known[-1], slope, None, [last.y + v for v in z])
         if estimate:
             moved = np.array([system.mass(v) for v in z]) + jumps
             now.error = system.resolvent(h / real).solve((h / real) * last.slope + (r.error @ moved) / real)
@@ -152,19 +151,3 @@ class RadauStepper:
 def _refuse_blown(y: np.ndarray, t: float) -> None:
     if not np.isfinite(y).all():
         raise Stopped(f"the solution is no longer finite at t = {t:.6g}")
-
-
-def uniform(stepper: Any, y: np.ndarray, times: np.ndarray, keep: Callable[[int, Step], None], tell: Any) -> None:
-    """Steps from each of ``times`` to the next."""
-    step = stepper.first(y, float(times[0]))
-    keep(0, step)
-    sizes = np.diff(times)
-    h = float((times[-1] - times[0]) / len(sizes)) if len(sizes) else 0.0
-    for k, own in enumerate(sizes):
-        own = h if abs(own - h) <= 1e-9 * abs(h) else float(own)
-        try:
-            step = stepper.advance(step, float(times[k]), own)
-        except SolveError as fault:
-            raise Stopped(f"the stage's system at t = {times[k]:.6g} cannot be solved: {fault}") from fault
-        keep(k + 1, step)
-        tell(k + 1)
