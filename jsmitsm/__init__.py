@@ -16,9 +16,9 @@ from jsmitsm.taylor.multi_indices import multi_indices
 __version__ = "0.2.0"
 
 __all__ = [
-    "Cloud", "Condition", "Constant", "CubicSpline", "Factorization", "Formulation", "Gaussian", "Kernel", "Method",
+    "Adapted", "Cloud", "Condition", "Constant", "CubicSpline", "Factorization", "Formulation", "Gaussian", "Kernel", "Method",
     "Problem", "Quality", "Solution", "SolveError", "Solver", "Stencils", "SuperGaussian", "TuneResult", "Wendland",
-    "box", "condition", "continuation", "dirichlet", "divergence", "factorize", "files", "fix", "free", "from_polygon",
+    "adapt", "box", "condition", "continuation", "dirichlet", "divergence", "factorize", "files", "fix", "free", "from_polygon",
     "from_sdf", "grad", "hessian", "interval", "laplacian", "meant", "multi_indices", "neumann", "no_progress",
     "partial", "periodic", "plot", "quadrature", "quality", "rectangle", "robin", "sdf", "show_versions", "solve",
     "stencils", "tune",
@@ -27,6 +27,7 @@ __all__ = [
 # Imported when first used, the solver too: who draws or makes clouds need not wait for it. Where each stands is said
 # twice, to type checkers and to Python: with a module's __getattr__ in sight a checker would believe in every name.
 if TYPE_CHECKING:
+    from jsmitsm.adaptation.adapt import Adapted, adapt
     from jsmitsm.cloud import sdf
     from jsmitsm.cloud.quadrature import quadrature
     from jsmitsm.cloud.quality import Quality, quality
@@ -42,6 +43,7 @@ if TYPE_CHECKING:
     from jsmitsm.tuning.tune import TuneResult, tune
 else:
     _LAZY = {
+        "Adapted": "adaptation.adapt",
         "Factorization": "solution.factorization",
         "Formulation": "solution.arguments",
         "Method": "solution.arguments",
@@ -49,6 +51,7 @@ else:
         "Solution": "solution.solution",
         "Solver": "linear.linsolve",
         "TuneResult": "tuning.tune",
+        "adapt": "adaptation.adapt",
         "continuation": "solution.nonlinear.continuation",
         "factorize": "solution.factorization",
         "files": "show",

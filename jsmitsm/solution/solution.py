@@ -14,7 +14,7 @@ from jsmitsm.cloud.quadrature import quadrature
 from jsmitsm.runtime.arrays import Array, ArrayLike, ValueOrFunction
 from jsmitsm.runtime.errors import SolveError
 from jsmitsm.runtime.tracers import frozen, is_traced, owned
-from jsmitsm.solution.estimate import error_estimate
+from jsmitsm.solution.estimate import Correction, correction
 from jsmitsm.solution.evaluation import checked_points, evaluated, in_domain, nearest_particles
 from jsmitsm.solution.fit import Recipe
 from jsmitsm.solution.flags import share
@@ -90,6 +90,11 @@ class Solution:
     def depth(self) -> int:
         """Degrees by which the local Taylor polynomials exceed the order."""
         return self._recipe.depth
+
+    @property
+    def operator_orders(self) -> tuple[int, ...]:
+        """Of every equation the order of its highest derivatives."""
+        return self._recipe.operator_orders
 
     @property
     def u(self) -> Array:
@@ -213,11 +218,22 @@ class Solution:
             return self._error
         if self._fit is None:
             raise ValueError("error_estimate: this solution was pickled without its problem; ask before pickling")
-        error = error_estimate(self._fit, self._values)
+        return self._keep(correction(self._fit, self._values))
+
+    def _keep(self, found: Correction) -> Array:
+        """The size of an estimated error, kept for the next who asks."""
+        error = abs(found.error)[..., 0] if self._recipe.fields == 1 else abs(found.error)
         if not is_traced(error, self._values):
             self._error = frozen(error)
             self._share = share(np.reshape(error, np.shape(self._values)), np.asarray(self._values))
         return error
+
+    def correction(self) -> Correction:
+        """What the error estimate is made of, for those who refine by it: signed errors, defects and their weights."""
+        self.refuse_stacked()
+        found = correction(self._fit, self._values)
+        self._keep(found)
+        return found
 
     def _estimated(self) -> float:
         """The estimated error over the solution, infinite where there is none."""

@@ -113,8 +113,8 @@ def finished(run: Run, values: Any, taylor: Any, good: Any, iterations: Any) -> 
     run.seconds["total"] = time.perf_counter() - run.began
     recipe = Recipe(
         scheme.method, disc.rec.order, disc.basis_terms, run.formulation, disc.rec.fields,
-        disc.rec.depth,
-    )
+        disc.rec.depth, tuple(disc.rec.orders),
+    )  # fmt: skip
     fit = Fit(run.problem, disc.cloud, disc.kernel, table(disc), taylor, recipe)
     report = None if is_traced(values) else run
     return Solution(values, disc.cloud, recipe, fit, good, iterations, run.stats(), report=report)
