@@ -3,7 +3,8 @@
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from jsmitsm.cloud.cloud import Cloud, box, interval, rectangle
+from jsmitsm.cloud.cloud import Cloud, box, rectangle
+from jsmitsm.cloud.line.interval import interval
 from jsmitsm.cloud.neighbours import Stencils, stencils
 from jsmitsm.equation.marks import meant
 from jsmitsm.equation.operators import divergence, grad, hessian, laplacian, partial

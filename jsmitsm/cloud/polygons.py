@@ -9,6 +9,7 @@ import numpy as np
 
 from jsmitsm.cloud import filling, levelset
 from jsmitsm.cloud.filling import Spacing
+from jsmitsm.cloud.line.path import followed
 
 _SHARP = np.deg2rad(20.0)  # a vertex that turns by more is a corner of the shape, not a sample of a curve
 
@@ -123,7 +124,7 @@ def edge_particles(loop: np.ndarray, spacing: Spacing, name: str) -> levelset.Bo
     normal = np.stack([edge[:, 1], -edge[:, 0]], axis=1) / np.linalg.norm(edge, axis=1, keepdims=True)
     before = np.roll(normal, 1, axis=0)
     turn = np.arctan2(np.abs(before[:, 0] * normal[:, 1] - before[:, 1] * normal[:, 0]), (before * normal).sum(axis=1))
-    paths = [_sampled(a, b, spacing) for a, b in zip(loop, ahead)]
+    paths = [followed(a, b, spacing) for a, b in zip(loop, ahead)]
     lengths = np.array([filling.path_lengths(path, spacing)[-1] for path in paths])
     if lengths.sum() < levelset.LEAST:
         raise ValueError(
@@ -158,13 +159,6 @@ def edge_particles(loop: np.ndarray, spacing: Spacing, name: str) -> levelset.Bo
     return levelset.Boundary(at[np.sort(order)], outward[np.sort(order)])
 
 
-def _sampled(a: np.ndarray, b: np.ndarray, spacing: Spacing) -> np.ndarray:
-    """Points along an edge, close enough together to follow a variable spacing."""
-    path = a + np.linspace(0.0, 1.0, 17)[:, None] * (b - a)
-    count = min(100_000, int(8 * filling.path_lengths(path, spacing)[-1]))
-    return path if count < 17 else a + np.linspace(0.0, 1.0, count)[:, None] * (b - a)
-
-
 class PolygonRegion:
     """Signed distance of a polygon with holes, by the nearest of many short pieces of its edges."""
 
@@ -173,7 +167,7 @@ class PolygonRegion:
 
         self._loops = loops
         chains = [
-            filling.divide(_sampled(a, b, spacing), spacing)[0]
+            filling.divide(followed(a, b, spacing), spacing)[0]
             for loop in loops
             for a, b in zip(loop, np.roll(loop, -1, axis=0))
         ]
