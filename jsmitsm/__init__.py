@@ -17,12 +17,12 @@ from jsmitsm.taylor.multi_indices import multi_indices
 __version__ = "0.2.0"
 
 __all__ = [
-    "Adapted", "Cloud", "Condition", "Constant", "CubicSpline", "Factorization", "Formulation", "Gaussian", "Kernel", "Method",
-    "Problem", "Quality", "Solution", "SolveError", "Solver", "Stencils", "SuperGaussian", "TuneResult", "Wendland",
-    "adapt", "box", "condition", "continuation", "dirichlet", "divergence", "factorize", "files", "fix", "free", "from_polygon",
-    "from_sdf", "grad", "hessian", "interval", "laplacian", "meant", "multi_indices", "neumann", "no_progress",
-    "partial", "periodic", "plot", "quadrature", "quality", "rectangle", "robin", "sdf", "show_versions", "solve",
-    "stencils", "tune",
+    "Adapted", "Cloud", "Condition", "Constant", "CubicSpline", "Factorization", "Formulation", "Gaussian", "Kernel",
+    "Method", "Problem", "Quality", "Solution", "SolveError", "Solver", "Stencils", "SuperGaussian", "TuneResult",
+    "Wendland", "adapt", "box", "condition", "continuation", "dirichlet", "divergence", "factorize", "files", "fix",
+    "free", "from_polygon", "from_sdf", "grad", "hessian", "interval", "laplacian", "meant", "multi_indices",
+    "neumann", "no_progress", "partial", "periodic", "plot", "quadrature", "quality", "rectangle", "robin", "sdf",
+    "show_versions", "solve", "stencils", "tune",
 ]  # fmt: skip
 
 # Imported when first used, the solver too: who draws or makes clouds need not wait for it. Where each stands is said

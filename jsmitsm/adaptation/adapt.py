@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Literal, Unpack
+from typing import Any, Literal, TypedDict, Unpack
 
 import numpy as np
 
@@ -14,20 +14,26 @@ from jsmitsm.adaptation.measure import NORMS, Quantity
 from jsmitsm.adaptation.rounds import ORDERS, Rounds
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.equation.problem import Problem
+from jsmitsm.linear.linsolve import Solver
 from jsmitsm.runtime.arrays import ValueOrFunction
 from jsmitsm.runtime.errors import did_you_mean, short
 from jsmitsm.runtime.progress import bar
-from jsmitsm.solution.arguments import SolveOptions
+from jsmitsm.solution.arguments import Depth, Formulation, Method
 from jsmitsm.solution.solution import Solution
 
 
-class AdaptOptions(SolveOptions, total=False):
+class AdaptOptions(TypedDict, total=False):
     """Options of :func:`jsmitsm.solve` for every solve of the search."""
 
+    method: Method
+    depth: Depth
+    basis_terms: int | None
+    formulation: Formulation
+    solver: Solver
     u0: ValueOrFunction | None
 
 
-OPTIONS = ("method", "depth", "basis_terms", "formulation", "solver", "u0")
+OPTIONS = tuple(AdaptOptions.__annotations__)
 
 
 @dataclass
@@ -58,7 +64,8 @@ class Adapted:
 
     def diagnose(self) -> str:
         """In words: how it went, what limited it, and what the solution says of itself."""
-        return "\n".join([repr(self), *self.messages, *(f"FLAG: {line}" for line in self.flags), self.solution.diagnose()])
+        flags = [f"FLAG: {line}" for line in self.flags]
+        return "\n".join([repr(self), *self.messages, *flags, self.solution.diagnose()])
 
     def __repr__(self) -> str:
         rounds = len(self.history["particles"])

@@ -1,8 +1,8 @@
 """What a problem says of itself before it is solved: where its source and coefficients need finer particles.
 
 A cloud knows source and coefficients by their Taylor polynomials at the particles. Here they are looked at between, on
-cubes that are halved until the polynomials about their centres tell what the corners see: a peak that no particle meets,
-a front, coefficients that oscillate. Nothing is solved for it.
+cubes that are halved until the polynomials about their centres tell what the corners see: a peak that no particle
+meets, a front, coefficients that oscillate. Nothing is solved for it.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from jsmitsm.taylor.multi_indices import count, multi_indices
 
 # Points that are asked for source and coefficients besides the cubes' own, by dimension: what is narrower than their
 # distance may be missed.
-SAMPLES = {1: 4096, 2: 20000, 3: 30000}
+SAMPLES = {1: 200000, 2: 20000, 3: 30000}
 # A cube looks so many of its widths away, as far as neighbours are that count.
 _AWAY = 1.25
 # Coefficients may differ from their Taylor polynomials by this part of the largest term of the operator.
@@ -126,13 +126,12 @@ def _gathered(values: np.ndarray, which: np.ndarray, n: int) -> np.ndarray:
 
 
 def data_of(problem: Problem, dim: int, degree: int) -> Data | None:
-    """The data of a problem; None where there is nothing to look at."""
-    if not callable(problem.pde) and not isinstance(problem.pde, Traced):
-        return None
+    """The data of a problem; None where it has several equations for several regions."""
     pde = problem.pde
-    traced = pde if isinstance(pde, Traced) else trace(pde, dim, problem.fields, params=problem.params)
-    data = Data(traced, problem.params, max(degree, 0))
-    return None if data.plain or max(traced.order) < 1 else data
+    if not callable(pde) and not isinstance(pde, Traced):
+        return None
+    return Data(pde if isinstance(pde, Traced) else trace(pde, dim, problem.fields, params=problem.params),
+                problem.params, degree)  # fmt: skip
 
 
 def unresolved(

@@ -11,8 +11,8 @@ from jsmitsm.adaptation.spacing_field import GROWTH
 # The error aimed at, in parts of the tolerance: what is predicted is not always met.
 SAFETY = 0.4
 # A spacing changes by at most these factors in a round: refined where the solution is smooth, where it is known not to
-# be, and coarsened.
-FINER, SINGULAR, COARSER = 0.3, 0.05, 3.0
+# be, and coarsened: freely where the error says nothing yet, later gently, or rounds would undo each other.
+FINER, SINGULAR, COARSER, GENTLY = 0.3, 0.05, 3.0, 1.25
 # Where refining helped with less than this part of the expected power, the solution is not smooth.
 _ROUGH = 0.6
 _SLOWEST = 0.35
@@ -22,7 +22,9 @@ _CHANGED, _AROUND = 1.3, 6
 # may be one of its so many neighbours without an equation of its own, as at the corner of a domain.
 _NEAR, _WORST, _HELD = 8, 12, 4
 # The error is at least the largest contribution, and random signs of many add up to this part of their root sum square.
-_SPREAD = 0.15
+_SPREAD = 0.25
+# While the error is larger than this the solution is not resolved, and an estimate of it means little.
+ROUGH = 0.3
 
 
 class Marks(NamedTuple):
@@ -75,9 +77,9 @@ def next_spacing(found: Marks, power: float, error: float, wanted: float, most: 
     dim = found.points.shape[1]
     lowest = np.where(found.singular, SINGULAR, FINER)
     rate = np.where(found.singular, found.rate, np.maximum(found.rate, _ROUGH * power))
-    goal, count = aim, float(len(eta))
+    goal, count, coarser = aim, float(len(eta)), COARSER if error > ROUGH else GENTLY
     for _ in range(200):
-        factor = np.clip((goal / eta) ** (1.0 / rate), lowest, COARSER)
+        factor = np.clip((goal / eta) ** (1.0 / rate), lowest, coarser)
         count = float(_children(factor, dim).sum())
         if count > most:
             goal *= 1.2

@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm.runtime.errors import SolveError
-from jsmitsm.solution.estimate import Correction
 from jsmitsm.solution.solution import Solution
+from jsmitsm.taylor.multi_indices import multi_indices
 
 NORMS = ("max", "l2")
 Quantity = Callable[[Solution], Any]
@@ -42,7 +42,7 @@ def measured(sol: Solution, spacing: np.ndarray, order: int, norm: str, quantity
     if not fine:
         return Measured(np.inf, np.ones(len(values)), scale)
     # A defect of u is one of the equation times spacing^order; with the volume around it counts for all of the domain.
-    far = (spacing / spacing.max()) ** min(0, sol.cloud.dim - order)
+    far = (spacing / spacing.max()) ** min(0, sol.cloud.dim - order) if found.adjoint is not None else 1.0
     defect = np.asarray(found.error if found.defect is None else found.defect)
     contribution = far * np.abs(defect).max(axis=1)
     relative = size(error, values, spacing, norm, sol.cloud.dim)
@@ -66,6 +66,31 @@ def size(error: np.ndarray, values: np.ndarray, spacing: np.ndarray, norm: str, 
         volume = spacing[:, None] ** dim
         part, whole = (np.sqrt(np.mean((x / largest) ** 2 * volume)) for x in (error, values))
     return float(part / whole) if whole > 0 else float(part)
+
+
+def gaps(sol: Solution) -> np.ndarray | None:
+    """By how much the polynomials of neighbours differ halfway between them (N,); None where they cannot be had.
+
+    What happens within a spacing, unseen by the particles, parts them: a layer at a wall, for instance.
+    """
+    try:
+        found = np.asarray(sol.coefficients, float)
+    except (ValueError, SolveError):
+        return None  # a source that is infinite on the boundary
+    from scipy.spatial import cKDTree
+
+    found = found.reshape(*found.shape[:2], -1)
+    points, dim = np.asarray(sol.cloud.points), sol.cloud.dim
+    near = cKDTree(points).query(points, k=range(2, min(2 * dim + 1, len(points)) + 1))[1]
+    index = multi_indices(dim, sol.order + sol.depth)
+    worst = np.zeros(len(points))
+    for k in range(near.shape[1]):
+        half = 0.5 * (points[near[:, k]] - points)
+        powers = np.stack([np.prod(half ** np.array(a), axis=1) for a in index], axis=1)
+        back = powers * np.array([(-1.0) ** sum(a) for a in index])
+        apart = np.einsum("nk,nkf->nf", powers, found) - np.einsum("nk,nkf->nf", back, found[near[:, k]])
+        worst = np.maximum(worst, np.abs(apart).max(axis=1))
+    return worst if np.isfinite(worst).all() else None
 
 
 def _weights(sol: Solution, quantity: Quantity) -> tuple[float, np.ndarray | None]:

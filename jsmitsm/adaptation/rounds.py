@@ -9,8 +9,9 @@ import numpy as np
 
 from jsmitsm.adaptation.data import Data, data_of, unresolved
 from jsmitsm.adaptation.first_cloud import Make, made
-from jsmitsm.adaptation.marking import SAFETY, Marks, marks, next_spacing
-from jsmitsm.adaptation.measure import Measured, Quantity, measured, size
+from jsmitsm.adaptation.layers import layers
+from jsmitsm.adaptation.marking import ROUGH, Marks, marks, next_spacing
+from jsmitsm.adaptation.measure import Measured, Quantity, gaps, measured, size
 from jsmitsm.adaptation.spacing_field import SpacingField
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.equation.problem import Problem
@@ -20,14 +21,18 @@ from jsmitsm.solution.solve import solve
 
 # Orders that may be used: two more are needed for the estimate, and two more for the estimate of the check.
 ORDERS = tuple(range(1, 13))
-# With "auto": up to which tolerance an order serves, by dimension. Low orders find where to refine as well as high ones.
+# With "auto": up to which tolerance an order serves, by dimension; while the error is rough, the first.
 _LADDER = {
     1: ((1e-2, 4), (0.0, 8)),
     2: ((2e-3, 4), (1e-5, 6), (0.0, 8)),
     3: ((1e-3, 4), (0.0, 6)),
 }
-# While the error is larger than this the solution is not resolved, and an estimate of it means little: low order.
-ROUGH = 0.3
+# A rough solution that a round leaves with this part of its error gets no better by particles.
+_HOPE = 0.5
+# Polynomials of neighbours may differ between them by so many tolerances.
+_GAP = 10.0
+# So many solves in a row may fail, each followed by one on a finer cloud.
+_REFUSED = 4
 # A cloud grows at most by this factor, small ones by more; large ones at least by the next.
 _GROWTH, _SMALL, _LEAST, _LARGE = 5.0, {1: 400, 2: 1500, 3: 3000}, 1.5, 5000
 # The look at source and coefficients, in parts of the largest |u|; degree of the polynomials it compares with.
@@ -49,13 +54,15 @@ class Rounds:
         self.max_particles, self.max_rounds, self.options, self.wanted_order = max_particles, max_rounds, options, order
         self.clock = began
         self.solution: Solution = None  # type: ignore[assignment]
-        self.error, self.number, self.reached = np.inf, None, False
+        self.error, self.reached = np.inf, False
+        self.number: float | None = None
         self.flags: list[str] = []
         self.messages: list[str] = []
         self.rows: list[tuple[int, int, float, float, float]] = []
         self.data: Data | None = None
-        self.least = 1
+        self.least, self.highest, self.shallow = 1, ORDERS[-1], False
         self.before: Marks | None = None
+        self.apart: np.ndarray | None = None  # gaps between neighbours, where they are what is wrong
 
     def history(self) -> dict[str, np.ndarray]:
         names = ("particles", "order", "error", "seconds", "smallest")
@@ -66,6 +73,7 @@ class Rounds:
     def run(self, cloud: Cloud, spacing: SpacingField, shown: Any) -> None:
         self.data = data_of(self.problem, cloud.dim, _DEGREE)
         if self.data is not None:
+            self.least = max(self.data.traced.order)
             spacing, cloud = self._looked_at(cloud, spacing, 1.0)
         refused = 0
         for number in range(self.max_rounds):
@@ -73,7 +81,7 @@ class Rounds:
                 sol, found = self._solved(cloud, spacing)
             except (ValueError, SolveError) as error:
                 refused += 1
-                if refused > 4 or not _refinable(error):
+                if refused > _REFUSED or not _refinable(error) or number == self.max_rounds - 1:
                     if self.solution is None:
                         raise
                     self.messages.append(f"Limited by a solve that failed: {error}")
@@ -98,7 +106,10 @@ class Rounds:
             spacing, cloud = following
 
     def _limit(self, what: str) -> None:
-        self.messages.append(f"Not reached: the error is estimated at {self.error:.1e}; limited by {what}.")
+        between = "" if self.apart is None else " at the particles, more between them"
+        self.messages.append(f"Not reached: the error is estimated at {self.error:.1e}{between}; limited by {what}.")
+        if self.solution is not None and not self.flags:
+            self.flags = self.solution.flags
 
     def _solved(self, cloud: Cloud, spacing: SpacingField) -> tuple[Solution, Measured]:
         order = self._order(cloud)
@@ -117,7 +128,8 @@ class Rounds:
             start = np.asarray(self.solution(np.asarray(cloud.points), outside="extrapolate"))
         if start is not None:
             options["u0"] = start
-        return solve(self.problem, cloud, order=order, throw=True, **{"depth": "auto", **options})
+        depth = 0 if self.shallow else "auto"
+        return solve(self.problem, cloud, order=order, throw=True, **{"depth": depth, **options})
 
     def _operator_order(self, sol: Solution) -> int:
         return max(sol.operator_orders)
@@ -127,11 +139,14 @@ class Rounds:
     def _order(self, cloud: Cloud) -> int:
         if self.wanted_order != "auto":
             return int(self.wanted_order)
-        last = _LADDER[cloud.dim]
-        wanted = next(order for limit, order in last if self.tol >= limit)
-        if not self.rows or self.error > ROUGH:
-            wanted = min(wanted, last[0][1])
-        return max(wanted, self.least)
+        ladder = _LADDER[cloud.dim]
+        wanted = next(order for limit, order in ladder if self.tol >= limit)
+        if not self.rows or self.rows[-1][2] > ROUGH:
+            wanted = min(wanted, ladder[0][1])
+        if len(self.rows) > 1 and self.rows[-1][2] > max(ROUGH, _HOPE * self.rows[-2][2]):
+            # More particles do not help: Taylor polynomials of something that is not smooth, the fewer the better.
+            self.highest, self.shallow = min(self.highest, max(self.rows[-1][1] - 2, self.least)), True
+        return max(min(wanted, self.highest), self.least)
 
     # ------------------------------------------------------------------ clouds
 
@@ -139,18 +154,29 @@ class Rounds:
         return made(self.make, spacing)
 
     def _looked_at(self, cloud: Cloud, spacing: SpacingField, scale: float) -> tuple[SpacingField, Cloud]:
-        """A first cloud that sees source and coefficients."""
+        """A first cloud that sees source, coefficients, and the layers that the operator makes."""
         assert self.data is not None
-        part = _PART
-        while True:
-            points, width = unresolved(self.data, cloud, spacing.largest_used, part, scale, self.max_particles // 4)
-            if not len(points):
-                return spacing, cloud
-            finer = spacing.joined(points, 1.5 * width)
-            made_ = self._cloud(finer)
-            if len(made_) <= self.max_particles:
-                return finer, made_
-            part *= 4.0
+        part, coarse, most = _PART, 1.0, self.max_particles // 4
+        at, thin = layers(self.data, cloud, spacing(np.asarray(cloud.points)))
+        for _ in range(20):
+            finer = spacing
+            if not self.data.plain:
+                points, width = unresolved(self.data, cloud, spacing.largest_used, part, scale, most)
+                finer = finer.joined(points, 1.5 * coarse * width)
+            finer = finer.joined(at, coarse * thin)
+            if finer is spacing:
+                break
+            try:
+                found = self._cloud(finer)
+            except ValueError as error:
+                if "cells" not in str(error):
+                    raise
+                coarse *= 4.0
+                continue
+            if len(found) <= most:
+                return finer, found
+            part, coarse = 4.0 * part, 2.0 * coarse
+        return spacing, cloud
 
     # ------------------------------------------------------------------ ends
 
@@ -160,7 +186,11 @@ class Rounds:
             return False
         self._checked(sol, cloud, spacing)
         self.flags = sol.flags
-        self.reached = self.error <= self.tol and not self.flags
+        apart = None if self.quantity is not None or self.norm != "max" else gaps(sol)
+        self.apart = None
+        if apart is not None and apart.max() > _GAP * self.tol * found.scale:
+            self.apart = apart
+        self.reached = self.error <= self.tol and not self.flags and self.apart is None
         return self.reached
 
     def _checked(self, sol: Solution, cloud: Cloud, spacing: SpacingField) -> None:
@@ -175,8 +205,8 @@ class Rounds:
             away = np.asarray(other.u).reshape(len(cloud), -1) - values
             apart = size(away, values, spacing(np.asarray(cloud.points)), self.norm, cloud.dim)
         else:
-            made_ = float(np.asarray(self.quantity(other)).sum())
-            apart = abs(made_ - self.number) / (abs(self.number) or 1.0)
+            number, again = self.number or 0.0, float(np.asarray(self.quantity(other)).sum())
+            apart = abs(again - number) / (abs(number) or 1.0)
         if apart > self.error:
             self.error = apart
 
@@ -184,7 +214,8 @@ class Rounds:
         errors = [row[2] for row in self.rows]
         if len(errors) <= _STALLED or len({row[1] for row in self.rows[-_STALLED - 1 :]}) > 1:
             return False
-        return min(errors[-_STALLED:]) > _BETTER * min(errors[:-_STALLED]) and self.rows[-1][0] > self.rows[-_STALLED][0]
+        grown = self.rows[-1][0] > max(self.rows[-_STALLED][0], _SMALL[self.solution.cloud.dim])
+        return grown and min(errors[-_STALLED:]) > _BETTER * min(errors[:-_STALLED])
 
     # ------------------------------------------------------------------ the next cloud
 
@@ -192,13 +223,16 @@ class Rounds:
         points, h = np.asarray(cloud.points), spacing(np.asarray(cloud.points))
         power = self.solution.order + 1.0 + min(0, cloud.dim - self._operator_order(self.solution))
         trusted = len(self.rows) > 1 and self.rows[-2][1] == self.rows[-1][1] and np.isfinite(found.error)
-        here = marks(points, h, found.contribution, power, self.before if trusted else None)
+        contribution, error = found.contribution, self.error if np.isfinite(self.error) else 1e3
+        if self.apart is not None:
+            contribution, error = self.apart, float(self.apart.max()) / found.scale / _GAP
+            trusted, self.apart = False, None
+        here = marks(points, h, contribution, power, self.before if trusted else None)
         self.before = here if np.isfinite(found.error) else None
         if len(cloud) >= self.max_particles:
             self._limit(f"the {self.max_particles} particles that were allowed (max_particles)")
             return None
         most = min(max(_GROWTH * len(cloud), _SMALL[cloud.dim]), self.max_particles)
-        error = self.error if np.isfinite(self.error) else 1e3
         wanted = self.tol if error > self.tol else 0.5 * error
         made_h, count = next_spacing(here, power, error, wanted, most)
         field = SpacingField(points, made_h, spacing.largest)

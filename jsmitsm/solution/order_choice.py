@@ -22,10 +22,10 @@ def check_tolerance(order: Any, tol: Any) -> None:
     if isinstance(order, str) and order == "auto":
         if isinstance(tol, bool) or not isinstance(tol, (int, float, np.number)) or not 0.0 < tol < 1.0:
             raise ValueError(
-                f'tol: order="auto" needs the wanted error, relative to the largest |u|, between 0 and 1, got {short(tol)}'
+                f'tol: order="auto" needs the wanted error, relative to the largest |u|, from 0 to 1, got {short(tol)}'
             )
     elif tol is not None:
-        raise ValueError(f'tol: got {short(tol)} with order={short(order)}; a tolerance chooses the order, order="auto"')
+        raise ValueError(f'tol: got {short(tol)} with order={short(order)}; a tolerance goes with order="auto"')
 
 
 def of_tolerance(solved: Callable[[int], tuple[Solution, Any]], tol: float) -> Solution:

@@ -87,7 +87,7 @@ def solve(
     """
     check_tolerance(order, tol)
 
-    def solved(order: int) -> tuple[Solution, Run]:
+    def solved(order: Any) -> tuple[Solution, Run]:
         run = prepared(
             problem, cloud, method=method, order=order, kernel=kernel, stencils=stencils, basis_terms=basis_terms,
             formulation=formulation, solver=solver, u0=u0, throw=throw, depth=depth,
@@ -97,7 +97,7 @@ def solve(
             return finished(run, values, None, good, 1), run
         return finished(run, *newton(run, u0)), run
 
-    return solved(order)[0] if order != "auto" or tol is None else of_tolerance(solved, tol)
+    return of_tolerance(solved, tol) if order == "auto" and tol is not None else solved(order)[0]
 
 
 def prepared(

@@ -34,7 +34,7 @@ def interval(a: float, b: float, n: int | None = None, *, spacing: SpacingLike |
     if spacing is None:
         return lattice((a,), (b,), (n,), 0.0, 0, names=("a", "b", "n"))
     if n is not None:
-        raise ValueError(f"n, spacing: got both, n={short(n)} and a spacing; give the number of particles or the spacing")
+        raise ValueError(f"n, spacing: got both, n={short(n)} and a spacing; give one of them")
     lattice((a,), (b,), (2,), 0.0, 0, names=("a", "b", "n"))  # judges the ends
     rule = spacing_function(spacing)
     ends: Any = np.array([[a], [b]], float)
