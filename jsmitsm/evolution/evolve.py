@@ -5,12 +5,10 @@ from __future__ import annotations
 import time
 from typing import Any, Literal
 
-
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.cloud.neighbours import Stencils
 from jsmitsm.equation.problem import Problem
 from jsmitsm.evolution.arguments import Scheme, check, saved_times, starting_values
-from jsmitsm.evolution.differentiable import differentiable
 from jsmitsm.evolution.evolution import Evolution
 from jsmitsm.evolution.march import march
 from jsmitsm.evolution.run import Run

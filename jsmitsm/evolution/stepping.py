@@ -20,7 +20,6 @@ from jsmitsm.evolution.system import System
 from jsmitsm.evolution.tableaux import RADAU, Additive
 
 
-
 class Drive(Protocol):
     """What drives a system: forces F, the held values' part of E, H, and the held values themselves."""
 
