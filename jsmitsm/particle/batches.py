@@ -23,6 +23,7 @@ from jsmitsm.particle.recursion import row_lifts
 from jsmitsm.particle.source_fit import source_weights
 from jsmitsm.runtime import one_kernel
 from jsmitsm.runtime.compiled import at_hand
+from jsmitsm.runtime.compiler_options import on_cpu
 from jsmitsm.runtime.size_classes import BLOCK, FEW, cloud_size, padded_size
 from jsmitsm.runtime.tracers import closes_over_traced, is_traced, recorded
 from jsmitsm.runtime.whole_program import called, in_one_program, only_run
@@ -126,7 +127,7 @@ def _in_size_classes(function: Any) -> Any:
         arguments = dict(zip(names, (points, kernel, ids, neighbours, given, each, whole)))
         if inside or (kernel is not None and closes_over_traced(kernel.tree_flatten()[1])):
             return _cut(inner(scheme, **arguments), m)
-        options = next(some for most, some in _EFFORT if size <= most) if jax.default_backend() == "cpu" else {}
+        options = on_cpu(next(some for most, some in _EFFORT if size <= most))
         most = _SMALL if operands.shared is None else _SMALL_SHARED
         small = scheme.rec.size * scheme.rec.fields <= most and one_kernel.available()
         return _cut(called(function, {"scheme": scheme}, arguments, tuple(options.items()), small), m)
