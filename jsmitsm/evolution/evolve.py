@@ -113,7 +113,7 @@ def evolve(
             raise ValueError(
                 "tol: under a JAX transform the steps must be known; give steps=, as many as a run with tol took"
             )
-        return run.differentiable(int(steps), parts)
+        return differentiable(run, int(steps), parts)
     total = int(steps) if steps is not None else 1000
     with bar("evolve", total, wanted=progress) as shown:
         return march(run, None if steps is None else int(steps), None if tol is None else float(tol), parts, shown)

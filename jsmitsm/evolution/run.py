@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import time
+from contextlib import nullcontext
 from typing import Any
 
+import jax
 import numpy as np
 
 from jsmitsm.cloud.cloud import Cloud
@@ -32,7 +34,7 @@ class Run:
         self.timed, self.cloud, self.start, self.t, self.began = timed, cloud, start, t, began
         self.order, self.stencils, self.throw, self.depth = order, stencils, throw, depth
         self.params = timed.problem.params[1]
-        self.traced = is_traced(self.params, start, t, cloud, timed.problem)
+        self.traced = is_traced(self.params, start, t, cloud, timed.problem, timed.rest, timed.masses)
         self.fields = timed.problem.fields
         self.second = bool(timed.masses[1].slots)
         self.flags: list[str] = []
@@ -119,7 +121,9 @@ class Run:
         options: dict[str, Any] = {"order": self.order, "mass": massed, "stencils": self.stencils, "depth": self.depth}
         reference = None
         if not timed.quasilinear:
-            pencil = assemble_pencil(problem, self.cloud, **options)
+            known = not is_traced(problem, self.cloud, timed.masses)
+            with jax.ensure_compile_time_eval() if known else nullcontext():  # under jit, too, what is known is computed
+                pencil = assemble_pencil(problem, self.cloud, **options)
         else:
             problem.pde = timed.space  # type: ignore[assignment]
             taylor = self._expansions(problem, u)

@@ -86,7 +86,7 @@ class System:
         """The equations (size,) without any rate: what holds at every moment."""
         m = self.masses[-1]
         moved = np.zeros(self.n, bool)
-        moved[m.rows[np.asarray(m.values) != 0]] = True
+        moved[m.rows if is_traced(m.values) else m.rows[np.asarray(m.values) != 0]] = True
         if self.second:
             return np.concatenate([np.zeros(self.n, bool), ~moved])
         return ~moved
@@ -113,7 +113,7 @@ class Resolvent:
             self._factor = RealFactor(self.entries, n, system.points)
 
     def _inner(self, r: Any, transpose: bool) -> Any:
-        if self._factor is not None:
+        if self._factor is not None and not is_traced(r):
             return self._factor.solve(r, transpose)
         values, rows, cols = self.entries
         rows, cols = (cols, rows) if transpose else (rows, cols)
