@@ -26,7 +26,7 @@ from jax.extend.core import Literal
 from jsmitsm.equation.field import field_p, frozen_p
 from jsmitsm.equation.linearizing import control, inner_jaxprs, is_mark, open_fields, slots_of
 from jsmitsm.equation.marks import ALONG, DIFFERENTIATED, MEANT
-from jsmitsm.runtime.jaxprs import bind, called, literal, program
+from jsmitsm.runtime.jaxprs import bind, called, literal, program, scan_sizes
 from jsmitsm.runtime.tracers import concrete
 from jsmitsm.taylor.multi_indices import Slot
 
@@ -225,7 +225,7 @@ class _Reader:
 
     def scan(self, eqn: Any, operands: list[_Value], scope: _Scope) -> list[_Value]:
         p = eqn.params
-        n, m, body = p["num_consts"], p["num_carry"], p["jaxpr"]
+        (n, m), body = scan_sizes(p), p["jaxpr"]
         fixed, carry, rows = operands[:n], operands[n : n + m], operands[n + m :]
         consts = [_Value(c) for c in body.consts]
         steps: dict[int, list[_Value]] = {}

@@ -13,7 +13,7 @@ from jax.extend.core import Literal
 
 from jsmitsm.equation.field import Field, LocalField, field_p, frozen_p
 from jsmitsm.equation.marks import DIFFERENTIATED
-from jsmitsm.runtime.jaxprs import EVERYTHING, bind, called, inner_jaxprs, levels, literal, program
+from jsmitsm.runtime.jaxprs import EVERYTHING, bind, called, inner_jaxprs, levels, literal, program, scan_sizes
 from jsmitsm.runtime.snapshot import snapshot
 from jsmitsm.runtime.tracers import owned
 from jsmitsm.taylor.elementwise import ELEMENTWISE
@@ -97,7 +97,7 @@ def _check_control(eqn: Any, kinds: list[int]) -> None:
         return [min(k, DEPENDENT) for k in some]
 
     if name == "scan":
-        n = p["num_consts"]
+        n, _ = scan_sizes(p)
         check_points(p["jaxpr"].jaxpr, kinds[:n] + loose(kinds[n:]))
     elif name == "while":
         n, m = p["cond_nconsts"], p["body_nconsts"]
@@ -159,7 +159,7 @@ def control(eqn: Any, vals: list[Any], walk: Callable[..., list[Any]]) -> list[A
         branches = [lambda operands, b=b: walk(b.jaxpr, b.consts, operands) for b in p["branches"]]
         return jax.lax.switch(vals[0], branches, vals[1:])
     if name == "scan":
-        n, m = p["num_consts"], p["num_carry"]
+        n, m = scan_sizes(p)
         body = p["jaxpr"]
 
         def step(carry: Any, row: Any) -> tuple[Any, Any]:

@@ -52,6 +52,14 @@ def called(eqn: Any) -> ClosedJaxpr | None:
     return None
 
 
+def scan_sizes(params: Any) -> tuple[int, int]:
+    """How many inputs of a ``scan`` are constants of its body, and how many are carried on; the others are rows."""
+    if "num_consts" in params:
+        return params["num_consts"], params["num_carry"]
+    constants, carried, _ = params["ft_in"].unpack()  # JAX 0.11 keeps the three as trees
+    return len(constants), len(carried)
+
+
 def literal(v: Any) -> np.ndarray:
     """The value of a literal, with its dtype."""
     return np.asarray(v.val, v.aval.dtype)
