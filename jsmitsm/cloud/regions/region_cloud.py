@@ -32,7 +32,7 @@ class RegionCloud(Cloud):
     >>> import jsmitsm as js
     >>> cloud = js.regions({"a": (0.0, 0.5), "b": (0.5, 1.0)}, spacing=0.125)
     >>> cloud.interfaces["a|b"], len(cloud.region("a"))
-    (array([[4, 9]]), 5)
+    (array([[4, 8]]), 5)
     """
 
     def __init__(
