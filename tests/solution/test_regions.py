@@ -167,11 +167,7 @@ def test_an_inclusion_of_any_conductivity(k, bound):
 
 
 def test_regions_meet_in_a_point_and_a_singular_one_is_told():
-<<<<<<< HEAD
-    """Four quadrants: where their conductivities alternate u = r^0.39 f(angle); where all are equal nothing is."""
-=======
     """Four quadrants: where their conductivities alternate u is r^0.39 f(angle); where all are equal it is smooth."""
->>>>>>> regions
     corner = {"a": (0, 0), "b": (-1, 0), "c": (-1, -1), "d": (0, -1)}
     shapes = {n: [(x, y), (x + 1, y), (x + 1, y + 1), (x, y + 1)] for n, (x, y) in corner.items()}
     cloud = js.regions(shapes, spacing=0.125)
