@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from jsmitsm.cloud import filling, levelset
+from jsmitsm.cloud.line.path import followed
 from jsmitsm.cloud.packing import relaxation
 from jsmitsm.cloud.packing.octree import Spacing
 
@@ -158,7 +159,7 @@ def edge_particles(
     """
     ahead = np.roll(loop, -1, axis=0)
     normal, before, turn = _turns(loop)
-    paths = [_sampled(a, b, spacing) for a, b in zip(loop, ahead)]
+    paths = [followed(a, b, spacing) for a, b in zip(loop, ahead)]
     lengths = np.array([filling.path_lengths(path, spacing)[-1] for path in paths])
     if lengths.sum() < levelset.LEAST:
         raise ValueError(
@@ -195,13 +196,6 @@ def edge_particles(
     return levelset.Boundary(at[np.sort(order)], outward[np.sort(order)])
 
 
-def _sampled(a: np.ndarray, b: np.ndarray, spacing: Spacing) -> np.ndarray:
-    """Points along an edge, close enough together to follow a variable spacing."""
-    path = a + np.linspace(0.0, 1.0, 17)[:, None] * (b - a)
-    count = min(100_000, int(8 * filling.path_lengths(path, spacing)[-1]))
-    return path if count < 17 else a + np.linspace(0.0, 1.0, count)[:, None] * (b - a)
-
-
 class PolygonRegion:
     """Signed distance of a polygon with holes, by the nearest of many short pieces of its edges."""
 
@@ -212,7 +206,7 @@ class PolygonRegion:
 
         self._loops = loops
         chains = [
-            filling.divide(_sampled(a, b, spacing), spacing)[0]
+            filling.divide(followed(a, b, spacing), spacing)[0]
             for loop in loops
             for a, b in zip(loop, np.roll(loop, -1, axis=0))
         ]

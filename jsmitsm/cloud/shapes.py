@@ -63,8 +63,9 @@ def from_sdf(
         nothing, or some particle is claimed by none.
 
     The boundary is found by marching triangles on an octree refined to the spacing and projected with Newton's
-    method; the interior is filled by dithering and relaxed by short-range repulsion (in the spirit of Fornberg and
-    Flyer, Comput. Math. Appl. 69, 2015, and of Slak and Kosec, SIAM J. Sci. Comput. 41, 2019).
+    method. The interior is a lattice, a little disordered, relaxed near the boundary by short-range repulsion; where
+    the spacing varies it is filled by dithering and relaxed everywhere (in the spirit of Fornberg and Flyer, Comput.
+    Math. Appl. 69, 2015, and of Slak and Kosec, SIAM J. Sci. Comput. 41, 2019).
 
     Examples
     --------

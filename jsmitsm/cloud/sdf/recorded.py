@@ -80,12 +80,13 @@ class Recorded:
 
 
 def _numbers(jaxpr: Any) -> float:
-    """About how many numbers one point takes; infinite for loops of unknown length."""
+    """About how many numbers one point takes; less than none for loops of unknown length, which are always interpreted:
+    JAX has no gradient of them."""
     total = 0.0
     for eqn in jaxpr.eqns:
         inner = sum(map(_numbers, inner_jaxprs(eqn)))
         if eqn.primitive.name == "while":
-            return math.inf
+            return -math.inf
         total += inner * eqn.params.get("length", 1) if inner else sum(v.aval.size for v in eqn.outvars)
     return total
 

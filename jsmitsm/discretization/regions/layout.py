@@ -60,6 +60,7 @@ class Regions:
     held: np.ndarray  # (N, F)
     images: Images
     kernel: None = None
+    contrast: float = 1.0  # of the conductivities on both sides of an interface, the largest
 
     @property
     def rec(self) -> Recursion:

@@ -66,6 +66,20 @@ def region_numbers(regions: Regions, taylor: Any = None, everywhere: bool = Fals
     return RegionNumbers(parts, found, spread(regions, [n.held for n in parts], regions.held.shape))
 
 
+def contrast(regions: Regions, nums: RegionNumbers) -> float:
+    """How many times more the better side of an interface conducts than the other, by the conditions; at least one."""
+    most = 1.0
+    for name, b in regions.interfaces.items():
+        coef = np.asarray(nums.between[name][0])
+        size = []
+        for side in (0, 1):
+            first = [k for k, (s, (_, a)) in enumerate(b.slots) if s == side and sum(a) == 1]
+            size.append(float(np.sqrt((coef[:, :, first] ** 2).sum(axis=(1, 2)).max(initial=0.0))) if first else 0.0)
+        if min(size) > 0:
+            most = max(most, max(size) / min(size))
+    return most
+
+
 def _slot_values(regions: Regions, name: str, b: Between, taylor: Any) -> Any:
     """The derivatives (S, P) of the expansions in the slots of the two sides."""
     pairs, names = regions.cloud.interfaces[name], [p.name for p in regions.parts]

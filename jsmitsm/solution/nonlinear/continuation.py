@@ -58,12 +58,12 @@ def continuation(
 
     Parameters
     ----------
-    problem : function
-        Of one number; returns the problem to solve.
+    problem : Problem
+        Function Of one number; returns the problem to solve.
     cloud : Cloud
         The particles it is solved on.
-    parameters : sequence of float
-        The stages, in the order in which to go; two or more.
+    parameters : str or sequence of str
+        Sequence of float The stages, in the order in which to go; two or more.
     u0 : array_like or function, optional
         Start of the first stage, as in ``js.solve``.
     arclength : bool
@@ -72,8 +72,8 @@ def continuation(
         before: [1.0, 2.0, 2.0] are the solutions at 2 before the turning point and behind it.
     steps : int
         With ``arclength``, the most steps along the branch; it ends there, or where the last parameter was passed.
-    **options : optional
-        Passed to ``js.solve``.
+    **options : any
+        Optional Passed to ``js.solve``.
 
     Returns
     -------

@@ -17,6 +17,7 @@ from jsmitsm.discretization.operator_kind import prefers_least_squares
 from jsmitsm.discretization.regions.layout import Regions, discretize_regions
 from jsmitsm.discretization.regions.rows import (
     RegionNumbers,
+    contrast,
     in_whole,
     joint_rows,
     joints,
@@ -103,6 +104,8 @@ class RegionsRun(Run):
                     "spreads between neighbours; the form that suits it is not made for clouds of several regions: "
                     "refine there."
                 )
+        if not is_traced(nums.between):
+            self.disc.contrast = contrast(self.disc, nums)
         self.rows = classes, rows = self.local_rows(nums)
         local = clock()
         made = *matrix(self.disc, classes, rows), whole_right_side(self.disc, nums, self.parts, self.bound)
