@@ -39,7 +39,8 @@ def linked(match):
 def on_files(files, config):
     """The executed notebooks become pages."""
     for path in sorted((ROOT / "notebooks").glob("*.ipynb")):
-        files.append(File.generated(config, f"notebooks/{path.stem}.md", content=notebook(json.loads(path.read_text()))))
+        content = notebook(json.loads(path.read_text()))
+        files.append(File.generated(config, f"notebooks/{path.stem}.md", content=content))
     return files
 
 

@@ -240,9 +240,25 @@ def divergence(v: Any) -> Any:
 def dt(u: Same, order: int = 1) -> Same:
     """The derivative of ``u`` in time, a function of the point; for the problems of ``js.evolve``.
 
-    Parameters: ``u``, the unknown field (or some of a system's fields); ``order``, 1 or 2.
-    Raises ``ValueError`` for what is no unknown, such as a derivative of it or a function of the point.
+    Parameters
+    ----------
+    u : field
+        The unknown, or some of a system's fields.
+    order : int
+        1 or 2.
 
+    Returns
+    -------
+    field
+        Of the kind of ``u``.
+
+    Raises
+    ------
+    ValueError
+        For what is no unknown, such as a derivative of it or a function of the point.
+
+    Examples
+    --------
     >>> import jsmitsm as js
     >>> heat = lambda u, x, t: js.dt(u)(x) - js.laplacian(u)(x)
     """

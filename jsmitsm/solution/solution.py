@@ -378,7 +378,28 @@ class Solution:
         return error
 
     def correction(self) -> Correction:
-        """What the error estimate is made of, for those who refine by it: signed errors, defects and their weights."""
+        """What the error estimate is made of, for those who refine by it.
+
+        Returns
+        -------
+        Correction
+            Signed errors, defects and their weights.
+
+        Raises
+        ------
+        ValueError
+            For a solution in several regions, which has no defects to refine by.
+
+        Examples
+        --------
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import jsmitsm as js
+        >>> ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(1.0)}
+        >>> problem = js.Problem(lambda u, x: js.laplacian(u)(x) - 6 * x[0], ends)  # x^3
+        >>> sol = js.solve(problem, js.interval(0.0, 1.0, 9))
+        >>> bool(abs(sol.correction().error).max() < 1e-10)
+        True
+        """
         self.refuse_stacked()
         if hasattr(self._fit, "error_estimate"):
             raise ValueError("correction: several regions have an error estimate, but no defects to refine by")

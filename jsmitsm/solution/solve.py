@@ -55,7 +55,7 @@ def solve(
         Total degree of the fit. "auto": the lowest even one from 4 whose estimated error is within ``tol``; where
         none is, the best one, with a flag that says so.
     tol : float, optional
-        With ``order="auto"``, the wanted error relative to the largest \|u\|. The cloud stays as it is:
+        With ``order="auto"``, the wanted error relative to the largest |u|. The cloud stays as it is:
         ``js.adapt`` makes one that the tolerance needs.
     depth : int or "auto"
         Degrees by which the recursion goes beyond the order: the local polynomials have degree order + depth, with

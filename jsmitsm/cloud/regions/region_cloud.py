@@ -23,17 +23,17 @@ class RegionCloud(Cloud):
 
     Attributes
     ----------
-    points, groups, normals : any
-        Array (N, D), mapping, array (N, D) As those of ``js.Cloud``. Interfaces are groups too, ``"a|b"``, of the
+    points, groups, normals : array (N, D), mapping, array (N, D)
+        As those of ``js.Cloud``. Interfaces are groups too, ``"a|b"``, of the
         copies of both sides; the normal of both is that from a to b.
     regions : tuple of str
         Mapping Maps a name to the particles of that region, in ascending order; every particle belongs to one.
-    interfaces : any
-        Mapping Maps ``"a|b"`` to the pairs (P, 2) of particles, first that in a. A particle where several
+    interfaces : mapping
+        Maps ``"a|b"`` to the pairs (P, 2) of particles, first that in a. A particle where several
         interfaces meet is in several pairs, and one at the end of an interface may belong to a group of the outer
         boundary.
-    interface_normals : any
-        Mapping Maps ``"a|b"`` to the unit normals (P, D) of the pairs, from a to b.
+    interface_normals : mapping
+        Maps ``"a|b"`` to the unit normals (P, D) of the pairs, from a to b.
 
     Examples
     --------

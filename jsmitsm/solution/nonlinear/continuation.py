@@ -72,8 +72,8 @@ def continuation(
         before: [1.0, 2.0, 2.0] are the solutions at 2 before the turning point and behind it.
     steps : int
         With ``arclength``, the most steps along the branch; it ends there, or where the last parameter was passed.
-    **options : any
-        Optional Passed to ``js.solve``.
+    **options : optional
+        Passed to ``js.solve``.
 
     Returns
     -------
