@@ -57,6 +57,16 @@ class Adapted:
         The number that was asked for, None without one.
     flags : list of str
         What speaks against the solution, in sentences; ``diagnose`` tells what limited the search besides.
+
+    Examples
+    --------
+    >>> import jax; jax.config.update("jax_enable_x64", True)
+    >>> import jsmitsm as js
+    >>> ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(0.0)}
+    >>> problem = js.Problem(lambda u, x: js.laplacian(u)(x) + 1.0, ends)
+    >>> found = js.adapt(problem, lambda spacing: js.interval(0.0, 1.0, spacing=spacing), 1e-6)
+    >>> found.reached, found.flags
+    (True, [])
     """
 
     solution: Solution

@@ -47,6 +47,13 @@ class Stencils:
         (N, w) int32 array; the particle itself comes first, -1 fills the row.
     radius : array (N,), optional
         (N,) float array, the distance within which all particles are listed; None where nothing needs it.
+
+    Examples
+    --------
+    >>> import jsmitsm as js
+    >>> found = js.stencils(js.interval(0.0, 1.0, 5), size=3)
+    >>> found.indices[0].tolist()
+    [0, 1, 2]
     """
 
     indices: Array

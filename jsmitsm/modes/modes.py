@@ -115,8 +115,8 @@ class Modes:
         >>> ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(0.0)}
         >>> string = js.Problem(lambda u, x: -js.laplacian(u)(x), ends)
         >>> modes = js.eigen(string, js.interval(0.0, 1.0, 41), 2)
-        >>> round(abs(float(modes(1, [[0.5]])[0])), 6)
-        0.0
+        >>> bool(abs(modes(1, [[0.5]])[0]) < 1e-4)
+        True
         """
         return self._between(k)(points, blend=blend, outside=outside)
 
@@ -149,8 +149,8 @@ class Modes:
         >>> ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(0.0)}
         >>> string = js.Problem(lambda u, x: -js.laplacian(u)(x), ends)
         >>> modes = js.eigen(string, js.interval(0.0, 1.0, 41), 2)
-        >>> round(abs(float(modes.grad(0, [[0.5]])[0, 0])), 6)
-        0.0
+        >>> bool(abs(modes.grad(0, [[0.5]])[0, 0]) < 1e-4)
+        True
         """
         return self._between(k).grad(points, blend=blend, outside=outside)
 

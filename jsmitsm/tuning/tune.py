@@ -58,6 +58,17 @@ class TuneResult:
         In words, where tuning had to step back, widen a support or stop.
     solves : int
         Number of solves, those of the reference and of the returned solution included.
+
+    Examples
+    --------
+    >>> import jax; jax.config.update("jax_enable_x64", True)
+    >>> import jsmitsm as js
+    >>> ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(0.0)}
+    >>> problem = js.Problem(lambda u, x: js.laplacian(u)(x) + x[0], ends)
+    >>> start = js.SuperGaussian(h=0.125, d=4.0)
+    >>> found = js.tune(problem, js.interval(0.0, 1.0, 17), start, order=3, steps=2)
+    >>> isinstance(found, js.TuneResult), sorted(found.history)
+    (True, ['d', 'h', 'lebesgue', 'objective'])
     """
 
     kernel: Kernel
