@@ -8,6 +8,8 @@ everywhere but where a docstring says otherwise, also where a plain norm would g
 The formulas are those of Quilez, "2D / 3D distance functions" (iquilezles.org/articles), rewritten
 so that the gradient is exact *on* the boundary, where particles are put.
 
+Examples
+--------
 >>> import jax.numpy as jnp, jsmitsm as js
 >>> plate = js.sdf.difference(js.sdf.rectangle((0, 0), (2, 1)), js.sdf.circle((1, 0.5), 0.25))
 >>> float(plate(jnp.array([1.0, 0.5])))
