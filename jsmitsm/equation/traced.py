@@ -110,9 +110,10 @@ class Traced:
             return jac, None
         return jac, self._compute(inputs, degree, False, True)[1]
 
-    def residual(self, points: Any, *, params: Any = None) -> Any:
-        """The values (E, N) of the residual at u = 0."""
-        return self._compute(self._inputs(points, 0, (), params, None), 0, False, True)[1][:, 0]
+    def residuals(self, points: Any, *, params: Any = None, slots: Any = None) -> Any:
+        """The residual alone (E, N) at the points, where the slots' derivatives are ``slots`` (S, N) or zero."""
+        inputs = self._inputs(points, 0, (), params, None if slots is None else slots[:, None])
+        return self._compute(inputs, 0, False, True)[1][:, 0]
 
     @cached_property
     def kinked_source(self) -> bool:

@@ -13,7 +13,7 @@ they grow without bound.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -181,6 +181,14 @@ def _of_lower_rank(scheme: Scheme, fitted: Any, lift: Any, length: Any, white: A
     chosen = independent(wide, len(first) - scheme.lost)
     z, q = null_space(chosen @ wide)
     return z, q @ chosen, damped * lift
+
+
+def unconstrained(scheme: Scheme) -> tuple[Scheme, Elimination]:
+    """The scheme of a plain polynomial fit of the same order, and what stands for the recursion that it has not."""
+    rec = replace(scheme.rec, degrees=(-1,) * len(scheme.rec.degrees), depth=0)
+    white = _whitening(rec)
+    made = Elimination(white, np.zeros((len(white), 0)), np.zeros(0), np.zeros((rec.fields, len(white))))
+    return replace(scheme, rec=rec, sourced=False, flat=False, lost=0), made
 
 
 def eliminate_on_host(scheme: Scheme, jac: np.ndarray, length: float = 1.0) -> Elimination:

@@ -327,3 +327,8 @@ def _far_away(run: Any, values: np.ndarray, nums: Any, out: list[str], found: di
             f"Coordinates up to {far:.0e} in {dtype} are known to {found['rounded']:.1g} of the spacing only: move the "
             "cloud to the origin, or use float64."
         )
+
+
+# The tests that ask the whole system, and those that ask one region of several alone.
+OF_THE_WHOLE = (_round_off, _condition, _far_away)
+OF_A_REGION = (_jumps, _waves, _roughness, _coefficients, _peclet)

@@ -67,12 +67,13 @@ def newton(run: Run, u0: Any) -> tuple[Any, Any, Any, Any]:
 
 def _refuse_jumps(run: Run, values: Any, taylor: Any) -> None:
     """Refuse jumps that the operator differentiates where they depend on u, as it has come out."""
-    disc, found = run.disc, run.disc.traced.branches
-    if found is None or not found.depends & FIELD:
-        return
-    slots, place = slot_series(disc.rec, found.slots, taylor, 0)[:, 0], (0,) * disc.rec.dim
-    given = [values[:, f] if b == place else slots[k] for k, (f, b) in enumerate(found.slots)]
-    refuse_jumps(disc, run.problem, (jnp if is_traced(given) else np).stack(given))
+    for disc, _, ids in run.operators():
+        found = disc.traced.branches
+        if found is None or not found.depends & FIELD:
+            continue
+        slots, place = slot_series(disc.rec, found.slots, taylor[ids], 0)[:, 0], (0,) * disc.rec.dim
+        given = [values[ids, f] if b == place else slots[k] for k, (f, b) in enumerate(found.slots)]
+        refuse_jumps(disc, disc.problem, (jnp if is_traced(given) else np).stack(given))
 
 
 def _repeats(rate: float) -> int:
@@ -115,12 +116,13 @@ class Found(NamedTuple):
 
 def _refuse_degenerate(run: Run) -> None:
     """An equation of which nothing is left at a particle leaves its fit free there, and the system regular."""
-    if run.nums is None or is_traced(run.nums.jac):
-        return
-    left = np.abs(np.asarray(run.nums.jac)[:, :, 0]).max(axis=1).min(axis=0)
-    if (left == 0).any():
-        at = np.broadcast_to(run.nums.ids, np.broadcast_shapes(run.nums.ids.shape, left.shape))[left == 0]
-        run.fail(f"{NOTHING} at {len(at)} particle(s), first {some(at)}", at)
+    for _, nums, ids in run.operators():
+        if nums is None or is_traced(nums.jac):
+            return
+        left = np.abs(np.asarray(nums.jac)[:, :, 0]).max(axis=1).min(axis=0)
+        if (left == 0).any():
+            at = ids[np.broadcast_to(nums.ids, np.broadcast_shapes(nums.ids.shape, left.shape))[left == 0]]
+            run.fail(f"{NOTHING} at {len(at)} particle(s), first {some(at)}", at)
 
 
 def _searched(record: Record, begin: Iterate, first: Iterate) -> Found:
