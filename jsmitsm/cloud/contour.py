@@ -23,16 +23,26 @@ def line(region: levelset.SdfRegion, spacing: Spacing) -> levelset.Boundary:
     return levelset.Boundary(points, np.where(negative[change + 1], -1.0, 1.0)[:, None])
 
 
-def contour(region: levelset.SdfRegion, spacing: Spacing) -> levelset.Boundary:
-    """The zero level in 2D: closed polylines from marching triangles, cut at corners, divided evenly."""
+def contour(region: levelset.SdfRegion, spacing: Spacing, forced: np.ndarray | None = None) -> levelset.Boundary:
+    """The zero level in 2D: closed polylines from marching triangles, cut at corners, divided evenly.
+
+    forced (C, 2): points of which those on the zero level become particles.
+    """
     cells, coarse = levelset.cells_near(region, spacing, 0.4)
     loops = _without_tips(region, _polylines(region, cells, coarse), spacing)
     if not loops:
         raise ValueError("spacing: too coarse for the shape, no boundary was found; reduce it below the shape's width")
-    parts = [_divided_loop(region, loop, spacing) for loop in loops]
+    parts = [_divided_loop(region, loop, spacing, forced) for loop in loops]
     boundary = levelset.Boundary(*(np.concatenate(arrays) for arrays in zip(*parts)))
     _check_seen(region, cells, np.concatenate([*(loop.points for loop in loops), boundary.points]))
     return boundary
+
+
+def corners(region: levelset.SdfRegion, spacing: Spacing) -> np.ndarray:
+    """The corners (C, 2) of the zero level in 2D."""
+    cells, coarse = levelset.cells_near(region, spacing, 0.4)
+    loops = _without_tips(region, _polylines(region, cells, coarse), spacing)
+    return np.concatenate([np.zeros((0, 2)), *(_corners(region, *loop)[1].points for loop in loops)])
 
 
 def _without_tips(
@@ -169,10 +179,14 @@ def _check_seen(region: levelset.SdfRegion, cells: octree.Cells, found: np.ndarr
         )
 
 
-def _divided_loop(region: levelset.SdfRegion, found: levelset.Boundary, spacing: Spacing) -> levelset.Boundary:
-    """Evenly spaced particles on a closed polyline of the zero level, its corners among them."""
+def _divided_loop(
+    region: levelset.SdfRegion, found: levelset.Boundary, spacing: Spacing, forced: np.ndarray | None = None
+) -> levelset.Boundary:
+    """Evenly spaced particles on a closed polyline of the zero level, its corners and ``forced`` points among them."""
     loop = found.points
     after, corners = _corners(region, *found)
+    if forced is not None and len(forced):
+        after, corners = _with_forced(region, loop, after, corners, forced, spacing)
     if len(after):
         loop = np.roll(loop, -(after[0] + 1), axis=0)  # begins right behind the first corner
         after = after - after[0] - 1
@@ -191,6 +205,33 @@ def _divided_loop(region: levelset.SdfRegion, found: levelset.Boundary, spacing:
     normals = np.concatenate([corners.normals, levelset.crossing_normals(smooth, outward)])
     kept = relaxation.uncrowded(points, spacing(points), len(after))
     return levelset.Boundary(points[kept], normals[kept])
+
+
+def _with_forced(
+    region: levelset.SdfRegion, loop: np.ndarray, after: np.ndarray, corners: levelset.Boundary, forced: np.ndarray,
+    spacing: Spacing,
+) -> tuple[np.ndarray, levelset.Boundary]:  # fmt: skip
+    """The corners of a polyline with further points of the zero level, in the order of the polyline."""
+    from scipy.spatial import cKDTree
+
+    h = spacing(forced)
+    on = np.abs(region.distance(forced)[0]) < 1e-9 * region.size
+    # The polyline is finer than the spacing; points of other loops are far from it.
+    on &= cKDTree(loop).query(forced)[0] < 0.5 * h
+    if len(corners.points):
+        on &= cKDTree(corners.points).query(forced)[0] > 1e-9 * region.size
+    forced = np.unique(forced[on], axis=0)
+    start, step = loop, np.roll(loop, -1, axis=0) - loop
+    square = np.maximum((step * step).sum(axis=1), 1e-300)
+    along = np.clip(((forced[:, None] - start) * step).sum(axis=2) / square, 0.0, 1.0)
+    away = np.linalg.norm(start + along[..., None] * step - forced[:, None], axis=2)
+    place = away.argmin(axis=1)
+    position = np.concatenate([after + 0.5, place + along[np.arange(len(forced)), place]])
+    # Two on one piece of the polyline would leave none between them; they are farther apart than that.
+    order = np.argsort(position, kind="stable")
+    points = np.concatenate([corners.points, forced])[order]
+    normals = np.concatenate([corners.normals, region.normals(forced)])[order]
+    return np.concatenate([after, place])[order], levelset.Boundary(points, normals)
 
 
 def _on_level(region: levelset.SdfRegion, x: np.ndarray, spacing: Spacing) -> tuple[np.ndarray, np.ndarray]:
