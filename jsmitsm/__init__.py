@@ -16,12 +16,12 @@ from jsmitsm.taylor.multi_indices import multi_indices
 __version__ = "0.2.0"
 
 __all__ = [
-    "Cloud", "Condition", "Constant", "CubicSpline", "Evolution", "Factorization", "Formulation", "Gaussian", "Kernel", "Method",
-    "Problem", "Quality", "Solution", "SolveError", "Solver", "Stencils", "SuperGaussian", "TuneResult", "Wendland",
-    "box", "condition", "continuation", "dirichlet", "divergence", "dt", "evolve", "factorize", "files", "fix", "free", "from_polygon",
-    "from_sdf", "grad", "hessian", "interval", "laplacian", "meant", "multi_indices", "neumann", "no_progress",
-    "partial", "periodic", "plot", "quadrature", "quality", "rectangle", "robin", "sdf", "show_versions", "solve",
-    "stencils", "tune",
+    "Cloud", "Condition", "Constant", "CubicSpline", "Evolution", "Factorization", "Formulation", "Gaussian", "Kernel",
+    "Method", "Modes", "Problem", "Quality", "Solution", "SolveError", "Solver", "Stencils", "SuperGaussian",
+    "TuneResult", "Wendland", "box", "condition", "continuation", "dirichlet", "divergence", "dt", "eigen", "evolve",
+    "factorize", "files", "fix", "free", "from_polygon", "from_sdf", "grad", "hessian", "interval", "laplacian",
+    "meant", "multi_indices", "neumann", "no_progress", "partial", "periodic", "plot", "quadrature", "quality",
+    "rectangle", "robin", "sdf", "show_versions", "solve", "stencils", "tune",
 ]  # fmt: skip
 
 # Imported when first used, the solver too: who draws or makes clouds need not wait for it. Where each stands is said
@@ -34,6 +34,8 @@ if TYPE_CHECKING:
     from jsmitsm.evolution.evolution import Evolution
     from jsmitsm.evolution.evolve import evolve
     from jsmitsm.linear.linsolve import Solver
+    from jsmitsm.modes.eigen import eigen
+    from jsmitsm.modes.modes import Modes
     from jsmitsm.runtime.versions import show_versions
     from jsmitsm.show import files, plot
     from jsmitsm.solution.arguments import Formulation, Method
@@ -48,11 +50,13 @@ else:
         "Factorization": "solution.factorization",
         "Formulation": "solution.arguments",
         "Method": "solution.arguments",
+        "Modes": "modes.modes",
         "Quality": "cloud.quality",
         "Solution": "solution.solution",
         "Solver": "linear.linsolve",
         "TuneResult": "tuning.tune",
         "continuation": "solution.nonlinear.continuation",
+        "eigen": "modes.eigen",
         "evolve": "evolution.evolve",
         "factorize": "solution.factorization",
         "files": "show",

@@ -112,7 +112,10 @@ def assemble_pencil(
     """
     disc = discretize(problem, cloud, "S", order, None, stencils, None, depth=0 if depth == "auto" else depth)
     if taylor is None and not disc.linear:
-        raise ValueError("problem: it is nonlinear in u, and has a pencil only where it is linearised")
+        raise ValueError(
+            "problem: its pde or a condition is nonlinear in u, but a pencil, and modes, are those of a linear "
+            "operator; linearise it about a state first"
+        )
     nums = numbers(disc, disc.problem, taylor)
     massed = np.ones(problem.fields, bool) if mass is None else np.asarray(mass, bool)
     return pencil_of(*laid_out(disc, nums, massed), nums)

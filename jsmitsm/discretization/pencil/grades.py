@@ -153,9 +153,13 @@ def _repaired(
         gain = np.flatnonzero(found < best[at])
         into = at[gain]
         near[into], far[into], best[into], changed[into] = tried[gain], wide[gain], found[gain], True
-    fitness.repaired = np.append(fitness.repaired, ids[changed & (best <= HOPELESS)])
+    # Where a condition makes a particle one-sided, dominance is lost by nature; and with the equation of a system it
+    # would lose what the condition says of other fields.
+    follows = best > (WRONG if part.cls.scheme.n_own else HOPELESS)
+    follows &= not (part.cls.scheme.n_own and disc.rec.fields > 1)
+    fitness.repaired = np.append(fitness.repaired, ids[changed & ~follows])
     out = []
-    kept, lost = np.flatnonzero(best <= HOPELESS), np.flatnonzero(best > HOPELESS)
+    kept, lost = np.flatnonzero(~follows), np.flatnonzero(follows)
     if len(kept):
         cls = replace(part.cls, ids=ids[kept], neighbours=near[kept])
         out.append(part_of(disc, nums, cls, far[kept], shared))
