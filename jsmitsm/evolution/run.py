@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from contextlib import nullcontext
 from typing import Any
 
 import jax
@@ -121,9 +120,7 @@ class Run:
         options: dict[str, Any] = {"order": self.order, "mass": massed, "stencils": self.stencils, "depth": self.depth}
         reference = None
         if not timed.quasilinear:
-            known = not is_traced(problem, self.cloud, timed.masses)
-            # Under jit, too, what is known is computed.
-            with jax.ensure_compile_time_eval() if known else nullcontext():
+            with jax.ensure_compile_time_eval():  # under jit, too, what is known is computed
                 pencil = assemble_pencil(problem, self.cloud, **options)
         else:
             problem.pde = timed.space  # type: ignore[assignment]
