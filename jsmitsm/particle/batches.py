@@ -22,6 +22,7 @@ from jsmitsm.particle.moments import Block, Row, Support
 from jsmitsm.particle.recursion import row_lifts
 from jsmitsm.runtime import one_kernel
 from jsmitsm.runtime.compiled import at_hand
+from jsmitsm.runtime.compiler_options import on_cpu
 from jsmitsm.runtime.size_classes import BLOCK, FEW, cloud_size, padded_size
 from jsmitsm.runtime.tracers import closes_over_traced, is_traced, recorded
 from jsmitsm.runtime.whole_program import called, in_one_program, only_run
@@ -101,7 +102,7 @@ def _first(x: np.ndarray, m: int) -> np.ndarray:
 
 def effort(size: int) -> Any:
     """The compiler's options for programs over so many particles."""
-    return next(some for most, some in _EFFORT if size <= most) if jax.default_backend() == "cpu" else {}
+    return on_cpu(next(some for most, some in _EFFORT if size <= most))
 
 
 def _in_size_classes(function: Any) -> Any:
