@@ -33,8 +33,8 @@ def regions_of(mesh: Any, key: str | None, names: list[str] | None) -> RegionClo
     total = sum(map(len, nodes.values()))
     group: Any = np.full(total, INTERIOR, object)
     normals = np.full((total, dim), np.nan)
-    for n in nodes:
-        for node, i in number[n].items():
+    for places in number.values():
+        for node, i in places.items():
             if node in outer:
                 group[i], normals[i] = outer[node]
     pairs, pair_normals = {}, {}
