@@ -1,7 +1,7 @@
 """Several regions beside finite elements on a fitted mesh: error against unknowns, ``python -m benchmarks.regions``.
 
 A disk of radius 0.5 and conductivity k in a plate, u = x + (1 - k) / (1 + k) R^2 x / r^2 outside, and a wall of two
-layers whose conductivities are a million apart. The elements are isoparametric triangles of degree 2 (scikit-fem), on the
+layers whose conductivities are a million apart. The elements are isoparametric triangles of degree 2 (scikit-fem), on a
 triangulation of the same particles, the middles of edges on the circle moved onto it: the usual fitted mesh.
 Errors are relative, in the Euclidean norm over the particles. Times are of the second of two solves, programs compiled.
 """

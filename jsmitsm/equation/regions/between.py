@@ -148,7 +148,7 @@ def between(problem: Problem, name: str, points: Any, normals: Any) -> Between:
             for flux, place in zip((first, second), places)
         ]
         if fields == 1:
-            _check_signs(first, second, made, normals, where)
+            _check_signs(first, second, made, normals, name)
         resistance = given["resistance"]
         if resistance is not None:
             resistance = component(problem, points, resistance, 0, 0, f"{where}.resistance")()
@@ -167,7 +167,7 @@ def _check_flux(flux: Traced, fields: int, where: str) -> None:
         raise ValueError(f"{where}: holds derivatives beyond the first, which fluxes of second-order equations lack")
 
 
-def _check_signs(first: Traced, second: Traced, made: Any, normals: Any, where: str) -> None:
+def _check_signs(first: Traced, second: Traced, made: Any, normals: Any, name: str) -> None:
     """Both fluxes count along the same normal: ValueError where they grow with the slope in opposite senses."""
     if is_traced(made, normals):
         return
@@ -177,9 +177,9 @@ def _check_signs(first: Traced, second: Traced, made: Any, normals: Any, where: 
         along.append(sum(np.asarray(jac)[0, k] * np.asarray(normals)[:, axis] for k, axis in slots))
     if np.ndim(along[0]) and np.ndim(along[1]) and (along[0] * along[1] < 0).all():
         raise ValueError(
-            f"{where}.flux: of opposite signs on the two sides, but both are +k n . grad u with the same n, which points "
-            f"from {where[6:-2].split('|')[0]!r} to {where[6:-2].split('|')[1]!r}; where a conductivity is meant to be "
-            "negative, state it as a residual"
+            f"bcs[{name!r}].flux: of opposite signs on the two sides, but both are +k n . grad u with the same n, which "
+            f"points from {name.split('|')[0]!r} to {name.split('|')[1]!r}; where a conductivity is meant to be negative, "
+            "state it as a residual"
         )
 
 
