@@ -177,9 +177,9 @@ def _check_signs(first: Traced, second: Traced, made: Any, normals: Any, name: s
         along.append(sum(np.asarray(jac)[0, k] * np.asarray(normals)[:, axis] for k, axis in slots))
     if np.ndim(along[0]) and np.ndim(along[1]) and (along[0] * along[1] < 0).all():
         raise ValueError(
-            f"bcs[{name!r}].flux: of opposite signs on the two sides, but both are +k n . grad u with the same n, which "
-            f"points from {name.split('|')[0]!r} to {name.split('|')[1]!r}; where a conductivity is meant to be negative, "
-            "state it as a residual"
+            f"bcs[{name!r}].flux: of opposite signs on the two sides, but both are +k n . grad u with the same n, "
+            f"which points from {name.split('|')[0]!r} to {name.split('|')[1]!r}; where a conductivity is meant to be "
+            "negative, state it as a residual"
         )
 
 
