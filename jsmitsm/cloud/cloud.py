@@ -309,18 +309,6 @@ def _describe_groups(groups: Any) -> str:
     return f"keys {list(groups)}" if isinstance(groups, Mapping) else type(groups).__name__
 
 
-def interval(a: float, b: float, n: int) -> Cloud:
-    """``n`` equally spaced particles on [a, b], ascending; groups interior, left, right.
-
-    Raises ValueError unless b > a and n is at least 2.
-
-    >>> import jsmitsm as js
-    >>> js.interval(0.0, 1.0, 5).spacing
-    0.25
-    """
-    return _lattice((a,), (b,), (n,), 0.0, 0, names=("a", "b", "n"))
-
-
 def rectangle(
     lo: Sequence[float], hi: Sequence[float], shape: Sequence[int], jitter: float = 0.0, seed: int = 0
 ) -> Cloud:
@@ -335,7 +323,7 @@ def rectangle(
     >>> len(js.rectangle((0, 0), (4, 9), (5, 10)))
     50
     """
-    return _lattice(lo, hi, shape, jitter, seed, dim=2)
+    return lattice(lo, hi, shape, jitter, seed, dim=2)
 
 
 def box(lo: Sequence[float], hi: Sequence[float], shape: Sequence[int], jitter: float = 0.0, seed: int = 0) -> Cloud:
@@ -346,11 +334,11 @@ def box(lo: Sequence[float], hi: Sequence[float], shape: Sequence[int], jitter: 
     >>> sorted(js.box((0, 0, 0), (1, 1, 1), (3, 3, 3)).groups)
     ['back', 'bottom', 'front', 'interior', 'left', 'right', 'top']
     """
-    return _lattice(lo, hi, shape, jitter, seed, dim=3)
+    return lattice(lo, hi, shape, jitter, seed, dim=3)
 
 
-def _lattice(lo, hi, shape, jitter, seed, dim=1, names=("lo", "hi", "shape")) -> Cloud:
-    """A lattice cloud of any dimension."""
+def lattice(lo, hi, shape, jitter, seed, dim=1, names=("lo", "hi", "shape")) -> Cloud:
+    """A lattice cloud of any dimension; ``names``: of the arguments in what is raised."""
     lo, hi = (_checked_corner(v, name, dim) for v, name in zip((lo, hi), names))
     if not (hi > lo).all():
         raise ValueError(f"{names[1]}: {hi.tolist()} must be greater than {names[0]} = {lo.tolist()} along every axis")

@@ -8,7 +8,9 @@ from typing import Any
 import numpy as np
 
 from jsmitsm.cloud import filling, levelset
-from jsmitsm.cloud.filling import Spacing
+from jsmitsm.cloud.line.path import followed
+from jsmitsm.cloud.packing import relaxation
+from jsmitsm.cloud.packing.octree import Spacing
 
 _SHARP = np.deg2rad(20.0)  # a vertex that turns by more is a corner of the shape, not a sample of a curve
 
@@ -157,7 +159,7 @@ def edge_particles(
     """
     ahead = np.roll(loop, -1, axis=0)
     normal, before, turn = _turns(loop)
-    paths = [_sampled(a, b, spacing) for a, b in zip(loop, ahead)]
+    paths = [followed(a, b, spacing) for a, b in zip(loop, ahead)]
     lengths = np.array([filling.path_lengths(path, spacing)[-1] for path in paths])
     if lengths.sum() < levelset.LEAST:
         raise ValueError(
@@ -190,15 +192,8 @@ def edge_particles(
     at, outward = np.concatenate(points), np.concatenate(normals)
     firsts = np.cumsum([0] + [len(part) for part in points[:-1]])  # the vertices that are kept
     order = np.concatenate([firsts, np.setdiff1d(np.arange(len(at)), firsts)])
-    order = order[filling.uncrowded(at[order], spacing(at[order]), len(firsts))]
+    order = order[relaxation.uncrowded(at[order], spacing(at[order]), len(firsts))]
     return levelset.Boundary(at[np.sort(order)], outward[np.sort(order)])
-
-
-def _sampled(a: np.ndarray, b: np.ndarray, spacing: Spacing) -> np.ndarray:
-    """Points along an edge, close enough together to follow a variable spacing."""
-    path = a + np.linspace(0.0, 1.0, 17)[:, None] * (b - a)
-    count = min(100_000, int(8 * filling.path_lengths(path, spacing)[-1]))
-    return path if count < 17 else a + np.linspace(0.0, 1.0, count)[:, None] * (b - a)
 
 
 class PolygonRegion:
@@ -211,7 +206,7 @@ class PolygonRegion:
 
         self._loops = loops
         chains = [
-            filling.divide(_sampled(a, b, spacing), spacing)[0]
+            filling.divide(followed(a, b, spacing), spacing)[0]
             for loop in loops
             for a, b in zip(loop, np.roll(loop, -1, axis=0))
         ]

@@ -9,7 +9,8 @@ import numpy as np
 
 from jsmitsm.cloud import contour, filling, levelset, polygons, surface
 from jsmitsm.cloud.cloud import INTERIOR, Cloud
-from jsmitsm.cloud.filling import Spacing, SpacingLike
+from jsmitsm.cloud.filling import SpacingLike
+from jsmitsm.cloud.packing.octree import Region, Spacing
 from jsmitsm.runtime.arrays import ArrayLike
 from jsmitsm.runtime.errors import short
 from jsmitsm.runtime.progress import bar
@@ -55,8 +56,9 @@ def from_sdf(
         nothing, or some particle is claimed by none.
 
     The boundary is found by marching triangles on an octree refined to the spacing and projected with Newton's
-    method; the interior is filled by dithering and relaxed by short-range repulsion (in the spirit of Fornberg and
-    Flyer, Comput. Math. Appl. 69, 2015, and of Slak and Kosec, SIAM J. Sci. Comput. 41, 2019).
+    method. The interior is a lattice, a little disordered, relaxed near the boundary by short-range repulsion; where
+    the spacing varies it is filled by dithering and relaxed everywhere (in the spirit of Fornberg and Flyer, Comput.
+    Math. Appl. 69, 2015, and of Slak and Kosec, SIAM J. Sci. Comput. 41, 2019).
 
     >>> import jsmitsm as js
     >>> plate = js.sdf.difference(js.sdf.rectangle((0, 0), (2, 1)), js.sdf.circle((1, 0.5), 0.25))
@@ -134,7 +136,7 @@ def from_polygon(
 
 
 def _cloud(
-    region: filling.Region,
+    region: Region,
     spacing: Spacing,
     lo: np.ndarray,
     hi: np.ndarray,
@@ -158,7 +160,7 @@ def _cloud(
 
 
 def own_normals(
-    region: filling.Region, spacing: Spacing, boundary: levelset.Boundary, named: dict[str, np.ndarray]
+    region: Region, spacing: Spacing, boundary: levelset.Boundary, named: dict[str, np.ndarray]
 ) -> np.ndarray:
     """The normals (B, D), at corners between groups those of the own side: what is said of a side holds to its end."""
     points, normals = boundary

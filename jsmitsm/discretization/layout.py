@@ -103,7 +103,7 @@ class Discretization:
 
 def discretize(
     problem: Problem, cloud: Cloud, method: str, order: int, kernel: Kernel | None,
-    stencils: Stencils | None, basis_terms: int | None, sources: bool = True, depth: int | str = 0,
+    stencils: Stencils | None, basis_terms: int | None, sources: bool = True, depth: int | str = "auto",
 ) -> Discretization:  # fmt: skip
     """Trace the problem, lay out its recursion and conditions, and find neighbours.
 

@@ -20,6 +20,7 @@ from jsmitsm.particle.elimination import Elimination, Scheme, eliminate
 from jsmitsm.particle.kernels import Kernel
 from jsmitsm.particle.moments import Block, Row, Support
 from jsmitsm.particle.recursion import row_lifts
+from jsmitsm.particle.source_fit import source_weights
 from jsmitsm.runtime import one_kernel
 from jsmitsm.runtime.compiled import at_hand
 from jsmitsm.runtime.compiler_options import on_cpu
@@ -151,6 +152,23 @@ def rows(
         return moments.row(scheme, *_prepared(scheme, points, kernel, i, near_ids, operands, jac, own))
 
     return _mapped(particle, ids, neighbours, operands)
+
+
+@_in_size_classes
+def sources(
+    scheme: Scheme, points: Any, kernel: Kernel | None, ids: Any, neighbours: Any, operands: Operands,
+    each: tuple[Any], whole: tuple = (),
+) -> Any:  # fmt: skip
+    """Weights (n, F, w, E) of the sources at ``neighbours`` (n, w) in the rows of the particles ``ids``.
+
+    each: what the rows say of the Taylor coefficients of the sources, (n, F, rows).
+    """
+    TRACES["rows"] += 1
+
+    def particle(i, near_ids, jac, own, sensitivity):
+        return source_weights(scheme.rec, moments.support(points, i, near_ids, None), sensitivity)
+
+    return _mapped(particle, ids, neighbours, operands, *each)
 
 
 @_in_size_classes

@@ -45,7 +45,7 @@ class SolveOptions(TypedDict, total=False):
 def discretized(
     problem: Problem, cloud: Cloud, method: str = "S", order: int = 4, kernel: Kernel | None = None,
     stencils: Stencils | None = None, basis_terms: int | None = None, formulation: str = "auto", solver: str = "auto",
-    depth: Depth = 0,
+    depth: Depth = "auto",
 ) -> Discretization:  # fmt: skip
     """Checked arguments, discretised."""
     check(problem, cloud, method, order, kernel, stencils, formulation, solver, depth=depth)
@@ -69,7 +69,7 @@ def of_regions(problem: Any, cloud: Any) -> bool:
 
 def check(
     problem, cloud, method, order, kernel, stencils, formulation="auto", solver="auto", u0=None, throw=True,
-    depth=0,
+    depth="auto",
 ) -> None:
     """Arguments of :func:`solve` that can be judged before any work."""
     for value, kind, name in ((problem, Problem, "problem"), (cloud, Cloud, "cloud")):

@@ -10,7 +10,8 @@ import numpy as np
 
 from jsmitsm.cloud import filling, levelset
 from jsmitsm.cloud.cloud import INTERIOR
-from jsmitsm.cloud.filling import Spacing, SpacingLike
+from jsmitsm.cloud.filling import SpacingLike
+from jsmitsm.cloud.packing.octree import Spacing
 from jsmitsm.cloud.regions.region_cloud import RegionCloud
 from jsmitsm.cloud.regions.shapes import Interval, Shape, shape_of
 from jsmitsm.cloud.shapes import Predicate, checked_bounds, checked_seed, grouped, own_normals

@@ -8,7 +8,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from jsmitsm.cloud import contour, levelset, polygons, surface
-from jsmitsm.cloud.filling import Spacing
+from jsmitsm.cloud.packing.octree import Spacing
 from jsmitsm.runtime.errors import short
 
 
