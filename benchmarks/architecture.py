@@ -36,12 +36,13 @@ ROWS = [
     {"particle": (0.0, 1.76), "cloud": (1.92, 1.76), "equation": (3.84, 1.76)},
     {"discretization": (0.0, 5.6)},
     {"solution": (0.0, 7.4)},
-    {"tuning": (0.0, 3.62), "show": (3.78, 3.62)},
+    {"tuning": (0.0, 2.36), "adaptation": (2.52, 2.36), "show": (5.04, 2.36)},
 ]
 BESIDE = {"linear": (5.76, 1.64)}
 COLOURS = {
     "runtime": "#e6e6e6", "taylor": "#e6e6e6", "particle": "#cfe5f5", "cloud": "#cfe5f5", "equation": "#cfe5f5",
-    "discretization": "#fbe3b5", "linear": "#cdebdf", "solution": "#f7d3c1", "tuning": "#f0dbe8", "show": "#f0dbe8",
+    "discretization": "#fbe3b5", "linear": "#cdebdf", "solution": "#f7d3c1", "tuning": "#f0dbe8",
+    "adaptation": "#f0dbe8", "show": "#f0dbe8",
 }  # fmt: skip
 # What goes from one package to the next on the sheet, and where.
 ARROWS = {
@@ -54,8 +55,9 @@ ARROWS = {
     ("equation", "discretization"): (4.72, "coefficients"),
     ("discretization", "solution"): (2.8, "rows of the global system"),
     ("linear", "solution"): (6.1, "factors"),
-    ("solution", "tuning"): (1.81, "values, estimates, gradients"),
-    ("solution", "show"): (5.59, "values, local polynomials"),
+    ("solution", "tuning"): (1.18, "estimates, gradients"),
+    ("solution", "adaptation"): (3.7, "signed errors, defects"),
+    ("solution", "show"): (6.22, "values, polynomials"),
 }
 # Sizes in points, and a line's height in inches.
 NAME, SAID, LISTED, LINE, PAD = 11, 8.2, 7.4, 0.15, 0.09

@@ -31,6 +31,8 @@ _LADDER = {
 _HOPE = 0.5
 # Polynomials of neighbours may differ between them by so many tolerances.
 _GAP = 10.0
+# A cloud of this part of the particles that are allowed is the last.
+_FULL = 0.8
 # So many solves in a row may fail, each followed by one on a finer cloud.
 _REFUSED = 4
 # A cloud grows at most by this factor, small ones by more; large ones at least by the next.
@@ -229,7 +231,7 @@ class Rounds:
             trusted, self.apart = False, None
         here = marks(points, h, contribution, power, self.before if trusted else None)
         self.before = here if np.isfinite(found.error) else None
-        if len(cloud) >= self.max_particles:
+        if len(cloud) >= _FULL * self.max_particles:
             self._limit(f"the {self.max_particles} particles that were allowed (max_particles)")
             return None
         most = min(max(_GROWTH * len(cloud), _SMALL[cloud.dim]), self.max_particles)
