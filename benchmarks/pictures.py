@@ -7,7 +7,9 @@ import matplotlib
 import numpy as np
 
 import jsmitsm as js
+from benchmarks.adaptation import true_error
 from benchmarks.commandline import arguments
+from benchmarks.nist import CASES as NIST
 from benchmarks.problems import CASES
 
 matplotlib.use("Agg")
@@ -65,7 +67,19 @@ def errors(plt):
     return fig
 
 
-def main(names=("first", "slices", "errors")):
+def adaptation(plt):
+    """A corner singularity to 1e-6, its place unknown."""
+    case = NIST["corner-270"]()
+    found = js.adapt(case.problem, case.make, 1e-6)
+    axes = js.plot.adaptation(found)
+    axes[0].set_title(f"{len(found.cloud)} particles; true error {true_error(case, found):.0e}", fontsize="medium")
+    return axes[0].figure
+
+
+PICTURES = ("first", "slices", "errors", "adaptation")
+
+
+def main(names=PICTURES):
     import matplotlib.pyplot as plt
 
     IMAGES.mkdir(parents=True, exist_ok=True)
@@ -77,4 +91,4 @@ def main(names=("first", "slices", "errors")):
 
 
 if __name__ == "__main__":
-    main(arguments(__doc__, names="picture").names or ("first", "slices", "errors"))
+    main(arguments(__doc__, names="picture").names or PICTURES)

@@ -22,7 +22,7 @@ _CHANGED, _AROUND = 1.3, 6
 # may be one of its so many neighbours without an equation of its own, as at the corner of a domain.
 _NEAR, _WORST, _HELD = 8, 12, 4
 # The error is at least the largest contribution, and random signs of many add up to this part of their root sum square.
-_SPREAD = 0.25
+_SPREAD = 0.2
 # While the error is larger than this the solution is not resolved, and an estimate of it means little.
 ROUGH = 0.3
 

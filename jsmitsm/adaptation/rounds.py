@@ -226,6 +226,7 @@ class Rounds:
         power = self.solution.order + 1.0 + min(0, cloud.dim - self._operator_order(self.solution))
         trusted = len(self.rows) > 1 and self.rows[-2][1] == self.rows[-1][1] and np.isfinite(found.error)
         contribution, error = found.contribution, self.error if np.isfinite(self.error) else 1e3
+        between = self.apart is not None
         if self.apart is not None:
             contribution, error = self.apart, float(self.apart.max()) / found.scale / _GAP
             trusted, self.apart = False, None
@@ -236,7 +237,8 @@ class Rounds:
             return None
         most = min(max(_GROWTH * len(cloud), _SMALL[cloud.dim]), self.max_particles)
         wanted = self.tol if error > self.tol else 0.5 * error
-        made_h, count = next_spacing(here, power, error, wanted, most)
+        made_h, _ = next_spacing(here, power, error, wanted, most)
+        made_h = np.minimum(made_h, h) if between else made_h
         field = SpacingField(points, made_h, spacing.largest)
         for _ in range(8):
             try:
