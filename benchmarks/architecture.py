@@ -36,13 +36,13 @@ ROWS = [
     {"particle": (0.0, 1.76), "cloud": (1.92, 1.76), "equation": (3.84, 1.76)},
     {"discretization": (0.0, 5.6)},
     {"solution": (0.0, 7.4)},
-    {"tuning": (0.0, 2.36), "adaptation": (2.52, 2.36), "show": (5.04, 2.36)},
+    {"tuning": (0.0, 1.75), "adaptation": (1.88, 1.75), "modes": (3.76, 1.75), "show": (5.65, 1.75)},
 ]
 BESIDE = {"linear": (5.76, 1.64)}
 COLOURS = {
     "runtime": "#e6e6e6", "taylor": "#e6e6e6", "particle": "#cfe5f5", "cloud": "#cfe5f5", "equation": "#cfe5f5",
     "discretization": "#fbe3b5", "linear": "#cdebdf", "solution": "#f7d3c1", "tuning": "#f0dbe8",
-    "adaptation": "#f0dbe8", "show": "#f0dbe8",
+    "adaptation": "#f0dbe8", "modes": "#f0dbe8", "show": "#f0dbe8",
 }  # fmt: skip
 # What goes from one package to the next on the sheet, and where.
 ARROWS = {
@@ -55,9 +55,10 @@ ARROWS = {
     ("equation", "discretization"): (4.72, "coefficients"),
     ("discretization", "solution"): (2.8, "rows of the global system"),
     ("linear", "solution"): (6.1, "factors"),
-    ("solution", "tuning"): (1.18, "estimates, gradients"),
-    ("solution", "adaptation"): (3.7, "signed errors, defects"),
-    ("solution", "show"): (6.22, "values, polynomials"),
+    ("solution", "tuning"): (0.88, "values, estimates"),
+    ("solution", "adaptation"): (2.76, "errors, defects"),
+    ("solution", "modes"): (4.64, "local polynomials"),
+    ("solution", "show"): (6.53, "values"),
 }
 # Sizes in points, and a line's height in inches.
 NAME, SAID, LISTED, LINE, PAD = 11, 8.2, 7.4, 0.15, 0.09

@@ -76,7 +76,22 @@ def adaptation(plt):
     return axes[0].figure
 
 
-PICTURES = ("first", "slices", "errors", "adaptation")
+def regions(plt):
+    """A disk in a plate, whose contact is imperfect: particles, and a temperature that jumps."""
+    disk = js.sdf.circle((0.0, 0.0), 0.5)
+    around = js.sdf.difference(js.sdf.rectangle((-1, -1), (1, 1)), disk)
+    cloud = js.regions({"disk": disk, "plate": around}, ((-1, -1), (1, 1)), 0.08)
+    k = {"disk": 10.0, "plate": 1.0}
+    contact = js.interface({name: lambda u, x, n, c=c: c * n @ js.grad(u)(x) for name, c in k.items()}, resistance=0.5)
+    bcs = {"boundary": js.dirichlet(lambda x: x[0]), "disk|plate": contact}
+    sol = js.solve(js.Problem({name: lambda u, x: js.laplacian(u)(x) for name in k}, bcs), cloud)
+    fig, (left, right) = plt.subplots(1, 2, figsize=(10, 3.8), layout="constrained")
+    js.plot.cloud(cloud, ax=left)
+    js.plot.solution(sol, ax=right)
+    return fig
+
+
+PICTURES = ("first", "slices", "errors", "regions", "adaptation")
 
 
 def main(names=PICTURES):

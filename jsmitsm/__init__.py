@@ -7,8 +7,9 @@ from jsmitsm.cloud.cloud import Cloud, box, rectangle
 from jsmitsm.cloud.line.interval import interval
 from jsmitsm.cloud.neighbours import Stencils, stencils
 from jsmitsm.equation.marks import meant
-from jsmitsm.equation.operators import divergence, grad, hessian, laplacian, partial
+from jsmitsm.equation.operators import divergence, dt, grad, hessian, laplacian, partial
 from jsmitsm.equation.problem import Condition, Problem, condition, dirichlet, fix, free, neumann, periodic, robin
+from jsmitsm.equation.regions.interface import interface
 from jsmitsm.particle.kernels import Constant, CubicSpline, Gaussian, Kernel, SuperGaussian, Wendland
 from jsmitsm.runtime.errors import SolveError, did_you_mean
 from jsmitsm.runtime.progress import no_progress
@@ -17,12 +18,13 @@ from jsmitsm.taylor.multi_indices import multi_indices
 __version__ = "0.2.0"
 
 __all__ = [
-    "Adapted", "Cloud", "Condition", "Constant", "CubicSpline", "Factorization", "Formulation", "Gaussian", "Kernel",
-    "Method", "Problem", "Quality", "Solution", "SolveError", "Solver", "Stencils", "SuperGaussian", "TuneResult",
-    "Wendland", "adapt", "box", "condition", "continuation", "dirichlet", "divergence", "factorize", "files", "fix",
-    "free", "from_polygon", "from_sdf", "grad", "hessian", "interval", "laplacian", "meant", "multi_indices",
-    "neumann", "no_progress", "partial", "periodic", "plot", "quadrature", "quality", "rectangle", "robin", "sdf",
-    "show_versions", "solve", "stencils", "tune",
+    "Adapted", "Cloud", "Condition", "Constant", "CubicSpline", "Evolution", "Factorization", "Formulation",
+    "Gaussian", "Kernel", "Method", "Modes", "Problem", "Quality", "Solution", "SolveError", "Solver", "Stencils",
+    "SuperGaussian", "TuneResult", "Wendland", "adapt", "box", "condition", "continuation", "dirichlet",
+    "divergence", "dt", "eigen", "evolve", "factorize", "files", "fix", "free", "from_polygon", "from_sdf", "grad",
+    "hessian", "interface", "interval", "laplacian", "meant", "multi_indices", "neumann", "no_progress", "partial",
+    "periodic", "plot", "quadrature", "quality", "rectangle", "regions", "robin", "sdf", "show_versions", "solve",
+    "stencils", "tune",
 ]  # fmt: skip
 
 # Imported when first used, the solver too: who draws or makes clouds need not wait for it. Where each stands is said
@@ -32,8 +34,13 @@ if TYPE_CHECKING:
     from jsmitsm.cloud import sdf
     from jsmitsm.cloud.quadrature import quadrature
     from jsmitsm.cloud.quality import Quality, quality
+    from jsmitsm.cloud.regions.making import regions
     from jsmitsm.cloud.shapes import from_polygon, from_sdf
+    from jsmitsm.evolution.evolution import Evolution
+    from jsmitsm.evolution.evolve import evolve
     from jsmitsm.linear.linsolve import Solver
+    from jsmitsm.modes.eigen import eigen
+    from jsmitsm.modes.modes import Modes
     from jsmitsm.runtime.versions import show_versions
     from jsmitsm.show import files, plot
     from jsmitsm.solution.arguments import Formulation, Method
@@ -45,15 +52,19 @@ if TYPE_CHECKING:
 else:
     _LAZY = {
         "Adapted": "adaptation.adapt",
+        "Evolution": "evolution.evolution",
         "Factorization": "solution.factorization",
         "Formulation": "solution.arguments",
         "Method": "solution.arguments",
+        "Modes": "modes.modes",
         "Quality": "cloud.quality",
         "Solution": "solution.solution",
         "Solver": "linear.linsolve",
         "TuneResult": "tuning.tune",
         "adapt": "adaptation.adapt",
         "continuation": "solution.nonlinear.continuation",
+        "eigen": "modes.eigen",
+        "evolve": "evolution.evolve",
         "factorize": "solution.factorization",
         "files": "show",
         "from_polygon": "cloud.shapes",
@@ -62,6 +73,7 @@ else:
         "quadrature": "cloud.quadrature",
         "quality": "cloud.quality",
         "sdf": "cloud",
+        "regions": "cloud.regions.making",
         "show_versions": "runtime.versions",
         "solve": "solution.solve",
         "tune": "tuning.tune",

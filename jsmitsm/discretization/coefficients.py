@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -11,7 +11,9 @@ import numpy as np
 
 from jsmitsm.discretization.degenerate import Degenerate, settled
 from jsmitsm.discretization.layout import Discretization, crowded
-from jsmitsm.equation.conditions import merged
+from jsmitsm.discretization.periodic import with_corners
+from jsmitsm.discretization.resolution.kinks import softened
+from jsmitsm.equation.conditions import group_conditions, merged
 from jsmitsm.equation.problem import Problem
 from jsmitsm.particle.recursion import Recursion, source_rows
 from jsmitsm.runtime.tracers import is_traced
@@ -59,11 +61,24 @@ def numbers(disc: Discretization, problem: Problem, taylor: Any = None, everywhe
     ids = np.arange(len(disc.cloud)) if everywhere else disc.active
     here = None if taylor is None else picked(taylor, ids)
     jac, source = operator_numbers(disc, problem, picked(disc.cloud.points, ids), here)
+    if disc.rec.depth and disc.linear and disc.traced.source == "variable" and disc.traced.kinked:
+        values = -disc.traced.residuals(disc.cloud.points, params=problem.params)
+        source = softened(disc, ids, source, values)
     held = [((group.ids, k), value()) for group in disc.groups for k, value in group.held.items()]
     own_ids, own, given = _own_numbers(disc, taylor)
     data, gamma = _data_numbers(disc, taylor)
     values = _filled(np.zeros(disc.held.shape), held)
     return settled(disc, problem, Numbers(ids, jac, source, own_ids, own, given, values, data, gamma))
+
+
+def conditions_of(disc: Discretization, problem: Problem) -> tuple[Any, Any, Any]:
+    """The conditions' values (held, given, gamma; see Numbers) of another problem of the same form."""
+    groups = group_conditions(problem, with_corners(problem, disc.cloud), disc.rec.order, disc.traced.order)
+    other = replace(disc, groups=groups)
+    held = [((group.ids, k), value()) for group in groups for k, value in group.held.items()]
+    _, _, given = _own_numbers(other, None)
+    _, gamma = _data_numbers(other, None)
+    return _filled(np.zeros(disc.held.shape), held), given, gamma
 
 
 def operator_numbers(disc: Discretization, problem: Problem, points: Any, taylor: Any) -> tuple[Any, Any]:

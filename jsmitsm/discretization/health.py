@@ -102,7 +102,7 @@ def _repaired(
     near = np.concatenate([cls.neighbours for cls in classes])
     best = _Best(Row(*map(np.concatenate, zip(*rows))), near, bool(scheme.n_own))
     width = min(len(points), round(2.2 * size))
-    for attempt in (_wider(1.5), _wider(2.2), _balanced(1.0), _balanced(1.5), _balanced(2.2)):
+    for attempt in (wider(1.5), wider(2.2), balanced(1.0), balanced(1.5), balanced(2.2)):
         left = np.flatnonzero(best.lebesgue > LEBESGUE)
         if not len(left):
             break
@@ -204,7 +204,7 @@ def _widened(x: np.ndarray, width: int, axis: int, fill: Any) -> np.ndarray:
     return np.pad(x, pad, constant_values=fill)
 
 
-def _wider(factor: float):
+def wider(factor: float):
     """The nearest neighbours, ``factor`` times as many."""
 
     def attempt(points: np.ndarray, ids: np.ndarray, size: int, walls: Walls | None) -> np.ndarray:
@@ -213,7 +213,7 @@ def _wider(factor: float):
     return attempt
 
 
-def _balanced(factor: float):
+def balanced(factor: float):
     """At least a sixteenth of the neighbours from each of eight directions (two in 1D)."""
 
     def attempt(points: np.ndarray, ids: np.ndarray, size: int, walls: Walls | None) -> np.ndarray:

@@ -26,7 +26,7 @@ from jax.extend.core import Literal
 from jsmitsm.equation.field import field_p, frozen_p
 from jsmitsm.equation.linearizing import control, inner_jaxprs, is_mark, open_fields, slots_of
 from jsmitsm.equation.marks import ALONG, DIFFERENTIATED, MEANT
-from jsmitsm.runtime.jaxprs import bind, called, literal
+from jsmitsm.runtime.jaxprs import bind, called, literal, program, scan_sizes
 from jsmitsm.runtime.tracers import concrete
 from jsmitsm.taylor.multi_indices import Slot
 
@@ -127,13 +127,10 @@ def branches(written: Any, consts: Sequence[Any], n_extras: int) -> Branches | N
     (reader,) = found
     if not reader.values:
         return None
-    jaxpr: Any = closed.jaxpr
-    inputs = len(jaxpr.invars) - (len(shaped) - n)
-    jaxpr = jaxpr.replace(constvars=[*jaxpr.constvars, *jaxpr.invars[inputs:]], invars=jaxpr.invars[:inputs])
     # Nothing traced is kept: of the outcomes their shapes.
     values = tuple(v._replace(value=None) for v in reader.values)
     outcomes = tuple(o._replace(value=None if o.value is None else tuple(o.value.shape)) for o in reader.outcomes)
-    return Branches(jaxpr, tuple(closed.consts), slots, values, outcomes)
+    return Branches(program(closed, last=len(written.constvars)), tuple(closed.consts), slots, values, outcomes)
 
 
 class _Scope(NamedTuple):
@@ -228,7 +225,7 @@ class _Reader:
 
     def scan(self, eqn: Any, operands: list[_Value], scope: _Scope) -> list[_Value]:
         p = eqn.params
-        n, m, body = p["num_consts"], p["num_carry"], p["jaxpr"]
+        (n, m), body = scan_sizes(p), p["jaxpr"]
         fixed, carry, rows = operands[:n], operands[n : n + m], operands[n + m :]
         consts = [_Value(c) for c in body.consts]
         steps: dict[int, list[_Value]] = {}

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from jax.extend.core import Literal
 
-from jsmitsm.runtime.jaxprs import DISCRETE, called, literal
+from jsmitsm.runtime.jaxprs import DISCRETE, called, literal, scan_sizes
 from jsmitsm.taylor.elementwise import ELEMENTWISE, RULES
 from jsmitsm.taylor.movement import MOVEMENT
 from jsmitsm.taylor.series import Ring
@@ -261,7 +261,7 @@ def _scan(eqn: Any, facts: list[Facts]) -> list[Facts] | None:
     p = eqn.params
     if p["length"] > UNROLL:
         return None
-    n, m = p["num_consts"], p["num_carry"]
+    n, m = scan_sizes(p)
     fixed, carry, rows = facts[:n], facts[n : n + m], facts[n + m :]
     consts = [constant(c) for c in p["jaxpr"].consts]
     order = range(p["length"])

@@ -20,6 +20,8 @@ from jsmitsm.taylor.multi_indices import MultiIndex, Slot, add
 field_p = Primitive("field")
 # Marks a factor that an operator treated as constant: it must not depend on the point.
 frozen_p = Primitive("frozen")
+# The time derivative of order j of field k goes by the number k + j RATE.
+RATE = 1 << 20
 
 
 def unit(dim: int, axis: int) -> MultiIndex:

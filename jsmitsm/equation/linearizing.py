@@ -13,7 +13,7 @@ from jax.extend.core import Literal
 
 from jsmitsm.equation.field import Field, LocalField, field_p, frozen_p
 from jsmitsm.equation.marks import DIFFERENTIATED
-from jsmitsm.runtime.jaxprs import EVERYTHING, bind, called, inner_jaxprs, levels, literal
+from jsmitsm.runtime.jaxprs import EVERYTHING, bind, called, inner_jaxprs, levels, literal, program, scan_sizes
 from jsmitsm.runtime.snapshot import snapshot
 from jsmitsm.runtime.tracers import owned
 from jsmitsm.taylor.elementwise import ELEMENTWISE
@@ -97,7 +97,7 @@ def _check_control(eqn: Any, kinds: list[int]) -> None:
         return [min(k, DEPENDENT) for k in some]
 
     if name == "scan":
-        n = p["num_consts"]
+        n, _ = scan_sizes(p)
         check_points(p["jaxpr"].jaxpr, kinds[:n] + loose(kinds[n:]))
     elif name == "while":
         n, m = p["cond_nconsts"], p["body_nconsts"]
@@ -159,7 +159,7 @@ def control(eqn: Any, vals: list[Any], walk: Callable[..., list[Any]]) -> list[A
         branches = [lambda operands, b=b: walk(b.jaxpr, b.consts, operands) for b in p["branches"]]
         return jax.lax.switch(vals[0], branches, vals[1:])
     if name == "scan":
-        n, m = p["num_consts"], p["num_carry"]
+        n, m = scan_sizes(p)
         body = p["jaxpr"]
 
         def step(carry: Any, row: Any) -> tuple[Any, Any]:
@@ -311,7 +311,7 @@ def record(
     first, _ = snapshot(
         lambda x, e, p: _values(residual(field, x, *e, *(() if params is None else (p,))), dtype), point, others, params
     )
-    flat: Any = first.jaxpr
+    flat = program(first)
     check_points(flat, [POINT] + [FREE] * (len(flat.invars) - 1))
     needed = [eqn for eqn, _ in levels(flat, [EVERYTHING])]
     slots = set()
@@ -341,13 +341,9 @@ def record(
 
     third = jax.make_jaxpr(derivatives)(*map(_shaped, second.jaxpr.invars))
     # The constants of the first trace are the last inputs of the third; make them constants again.
-    n, jaxpr = len(flat.constvars), third.jaxpr
-    jaxpr = jaxpr.replace(
-        constvars=[*jaxpr.constvars, *jaxpr.invars[len(jaxpr.invars) - n :]],
-        invars=jaxpr.invars[: len(jaxpr.invars) - n],
-    )
+    made = program(third, last=len(flat.constvars))
     kept = tuple(map(owned, (*third.consts, *first.consts)))  # the user may change the arrays in place
-    return Record(jaxpr, kept, ordered, tuple(outputs), flat.outvars[0].aval.shape[0], flat)
+    return Record(made, kept, ordered, tuple(outputs), flat.outvars[0].aval.shape[0], flat)
 
 
 def _shaped(v: Any) -> jax.ShapeDtypeStruct:

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.ad_checkpoint import checkpoint_name
 
-from jsmitsm.equation.field import Field, LocalField, total, unit
+from jsmitsm.equation.field import RATE, Field, LocalField, total, unit
 from jsmitsm.equation.marks import ALONG, DIFFERENTIATED
 from jsmitsm.taylor.multi_indices import MultiIndex
 
@@ -162,6 +162,27 @@ def divergence(v: Any) -> Any:
         return total(_along(component(i), i)(x) for i in range(dim))
 
     return total_slope
+
+
+def dt(u: Same, order: int = 1) -> Same:
+    """The derivative of ``u`` in time, a function of the point; for the problems of :func:`jsmitsm.evolve`.
+
+    Parameters: ``u``, the unknown field (or some of a system's fields); ``order``, 1 or 2.
+    Raises ``ValueError`` for what is no unknown, such as a derivative of it or a function of the point.
+
+    >>> import jsmitsm as js
+    >>> heat = lambda u, x, t: js.dt(u)(x) - js.laplacian(u)(x)
+    """
+    if isinstance(order, bool) or order not in (1, 2):
+        raise ValueError(f"order: js.dt(u, order) takes 1 or 2, got {order!r}")
+    if isinstance(u, LocalField):
+        return u._map(lambda f: dt(f, order))
+    if not isinstance(u, Field) or any(sum(index) for _, index in u.terms):
+        raise ValueError(
+            "u: js.dt takes the unknown u itself, or u[k] of a system; write the rate of a product by its rule, and a "
+            "derivative of a rate as an unknown of its own"
+        )
+    return Field(u.dim, {(k + order * RATE, index): c for (k, index), c in u.terms.items()})
 
 
 def _check_last_axis(shape: tuple[int, ...], dim: int) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -13,9 +14,10 @@ from jsmitsm.equation.branches import branches
 from jsmitsm.equation.dependence import EXTRAS, FIELD, JUMPS, POINT, Facts
 from jsmitsm.equation.field import local_field
 from jsmitsm.equation.linearizing import Record, record
-from jsmitsm.equation.recording import recalled
 from jsmitsm.equation.traced import Traced
+from jsmitsm.runtime.recall.recording import recalled
 from jsmitsm.runtime.tracers import is_traced
+from jsmitsm.taylor.multi_indices import Slot
 
 
 def trace(
@@ -71,19 +73,47 @@ def _holds_tracers(traced: Traced) -> bool:
     return is_traced(traced._record.consts)
 
 
-def _classified(r: Record, dim: int, fields: int, n_extras: int, params_tree: Any) -> Traced:
-    """Read off the recorded operations what kind of residual it is."""
+def restricted(traced: Traced, slots: Sequence[Slot], affine: bool = False) -> Traced:
+    """The same record as a residual of some of its slots alone; the others are zero.
+
+    affine: the coefficients of these slots depend on no slot, and only they are wanted: a linear operator, no source.
+    """
+    r = traced._record
+    chosen = _classified(r, traced.dim, traced.fields, traced._n_extras, traced._params_tree, slots)
+    return replace(chosen, linear=True, source="zero", branches=None) if affine else chosen
+
+
+def moving(traced: Traced, leaf: int) -> tuple[set[Slot], bool]:
+    """The slots whose coefficients depend on a field or on one leaf of the parameters; whether the rest of R does.
+
+    The rest: the residual where all slots are zero, which may depend on the leaf.
+    """
+    r = traced._record
+    facts, place = _facts(r, traced._n_extras, None, leaf), {slot: k for k, slot in enumerate(r.slots)}
+    zero = r.jaxpr.invars[0].aval.dtype.type(0)
+    found = set()
+    for slot in traced.slots:
+        out = r.outputs[place[slot]]
+        if out is None or _bits(facts[out]) & (FIELD | JUMPS):
+            found.add(slot)
+    return found, bool(_bits(_facts(r, traced._n_extras, zero, leaf)[0]) & FIELD)
+
+
+def _classified(
+    r: Record, dim: int, fields: int, n_extras: int, params_tree: Any, chosen: Sequence[Slot] | None = None
+) -> Traced:
+    """Read off the recorded operations what kind of residual it is, of the chosen slots (None: of all)."""
     zero = r.jaxpr.invars[0].aval.dtype.type(0)
     facts = _facts(r, n_extras, None)
     pattern, every = np.zeros((r.n_equations, len(r.slots)), bool), 0
     for k, out in enumerate(r.outputs):
-        if out is not None:
+        if out is not None and (chosen is None or r.slots[k] in chosen):
             pattern[:, k] = ~(facts[out].known & (facts[out].value == 0))
             every |= _bits(facts[out])
     jumps = bool(_bits(facts[0]) & JUMPS)
     linear = not every & (FIELD | JUMPS) and not jumps
     # A slot that only passes through a jump has no coefficient, yet the residual needs its value.
-    keep = [k for k in range(len(r.slots)) if pattern[:, k].any() or jumps]
+    keep = [k for k in range(len(r.slots)) if pattern[:, k].any() or jumps and (chosen is None or r.slots[k] in chosen)]
     pattern = pattern[:, keep]
     slots = tuple(r.slots[k] for k in keep)
     rest = _facts(r, n_extras, zero)[0]
@@ -114,8 +144,11 @@ def _bits(facts: Facts) -> int:
     return int(np.bitwise_or.reduce(facts.depends, axis=None)) if facts.depends.size else 0
 
 
-def _facts(r: Record, n_extras: int, field_value: Any) -> list[Facts]:
-    """Facts about all outputs; ``field_value``: what every slot is known to be, or None."""
+def _facts(r: Record, n_extras: int, field_value: Any, moved: int | None = None) -> list[Facts]:
+    """Facts about all outputs; ``field_value``: what every slot is known to be, or None.
+
+    moved: a leaf of the parameters that counts as a field.
+    """
     first = 1 + len(r.slots)
     args = []
     for k, v in enumerate(r.jaxpr.invars):
@@ -123,5 +156,6 @@ def _facts(r: Record, n_extras: int, field_value: Any) -> list[Facts]:
             args.append(dependence.known(field_value))
             continue
         bit = POINT if k == 0 else FIELD if k < first else EXTRAS if k < first + n_extras else 0
+        bit = FIELD if moved is not None and k == first + n_extras + moved else bit
         args.append(dependence.unknown(v.aval.shape, v.aval.dtype, bit))
     return dependence.interpret(r.jaxpr, [dependence.constant(c) for c in r.consts], args)

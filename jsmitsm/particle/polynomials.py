@@ -109,15 +109,15 @@ def functionals(slots: Sequence[Slot], coef: Any, p: Any, rec: Recursion, length
 
 
 @lru_cache(maxsize=32)
-def whitening(dim: int, order: int) -> np.ndarray:
+def whitening(dim: int, order: int, pinned: bool = False) -> np.ndarray:
     """A triangular T (K, K): the polynomials s^a T are orthonormal over the unit ball under the
-    default weight, so that normal equations of the moment systems are safe."""
+    default weight, so that normal equations of the moment systems are safe. Pinned: without the constant."""
     nodes, weights = np.polynomial.legendre.leggauss(order + 12)
     grid = np.stack(np.meshgrid(*[nodes] * dim, indexing="ij"), axis=-1).reshape(-1, dim)
     mass = np.prod(np.stack(np.meshgrid(*[weights] * dim, indexing="ij"), axis=-1).reshape(-1, dim), axis=1)
     inside = (grid**2).sum(axis=1) <= 1
     grid, mass = grid[inside], mass[inside]
     root = np.sqrt(mass / mass.sum() * np.exp(-4 * (grid**2).sum(axis=1)))
-    p = np.stack([np.prod(grid ** np.array(a), axis=1) for a in multi_indices(dim, order)], axis=1)
+    p = np.stack([np.prod(grid ** np.array(a), axis=1) for a in multi_indices(dim, order)[int(pinned) :]], axis=1)
     r = np.linalg.qr(root[:, None] * p, mode="r")
     return np.linalg.inv(r * np.sign(np.diag(r))[:, None])

@@ -163,6 +163,8 @@ def row_lifts(rec: Recursion, length: Any, xp: Any = jnp) -> Any:
     Integer powers are products: many times cheaper than a general power.
     """
     levels, place = np.unique([rec.levels[e] + sum(c) for e, c in _rows(rec)], return_inverse=True)
+    if not len(levels):
+        return xp.zeros(0)
     return xp.stack([length ** int(k) for k in levels])[place]
 
 

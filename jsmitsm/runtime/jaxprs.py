@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -22,6 +23,24 @@ CALLS = {"jit", "pjit", "closed_call", "core_call", "call", "remat", "checkpoint
          "custom_vjp_call_jaxpr", "custom_lin", "custom_vmap_call", "composite"}  # fmt: skip
 
 
+@dataclass(frozen=True, eq=False)
+class Program:
+    """A jaxpr whose constants are kept elsewhere. JAX's own tells constants from inputs by the values it holds."""
+
+    constvars: tuple[Any, ...]
+    invars: tuple[Any, ...]
+    outvars: tuple[Any, ...]
+    eqns: tuple[Any, ...]
+
+
+def program(closed: ClosedJaxpr, last: int = 0) -> Program:
+    """The program of a trace without its constants; its ``last`` inputs become constants too."""
+    jaxpr = closed.jaxpr
+    inputs = len(jaxpr.invars) - last
+    constvars = (*jaxpr.constvars, *jaxpr.invars[inputs:])
+    return Program(constvars, tuple(jaxpr.invars[:inputs]), tuple(jaxpr.outvars), tuple(jaxpr.eqns))
+
+
 def called(eqn: Any) -> ClosedJaxpr | None:
     """The jaxpr of an operation that only calls one, else None."""
     if eqn.primitive.name not in CALLS:
@@ -31,6 +50,14 @@ def called(eqn: Any) -> ClosedJaxpr | None:
             inner = eqn.params[key]
             return inner if isinstance(inner, ClosedJaxpr) else ClosedJaxpr(inner, ())
     return None
+
+
+def scan_sizes(params: Any) -> tuple[int, int]:
+    """How many inputs of a ``scan`` are constants of its body, and how many are carried on; the others are rows."""
+    if "num_consts" in params:
+        return params["num_consts"], params["num_carry"]
+    constants, carried, _ = params["ft_in"].unpack()  # JAX 0.11 keeps the three as trees
+    return len(constants), len(carried)
 
 
 def literal(v: Any) -> np.ndarray:

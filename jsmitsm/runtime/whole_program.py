@@ -27,6 +27,7 @@ from jax.interpreters import ad, batching, mlir
 
 from jsmitsm.runtime import one_kernel
 from jsmitsm.runtime.collector import uncollected
+from jsmitsm.runtime.compiler_options import on_cpu
 from jsmitsm.runtime.tracers import is_traced, recorded
 
 # Options as pairs; None: f runs as it stands, in numpy, and its derivatives are compiled with little effort.
@@ -113,7 +114,7 @@ class Program:
 
         part.__name__ = name
         if options is None:
-            options = tuple(_LITTLE.items()) if jax.default_backend() == "cpu" else ()
+            options = tuple(on_cpu(_LITTLE).items())
         function.__name__ = name
         if base:
             function = _to_be_run(function)

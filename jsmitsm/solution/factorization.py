@@ -111,7 +111,7 @@ def _same(x: Any, y: Any) -> bool:
 def factorize(
     problem: Problem, cloud: Cloud, *, method: Method = "S", order: int = 4, kernel: Kernel | None = None,
     stencils: Stencils | None = None, basis_terms: int | None = None, formulation: Formulation = "auto",
-    solver: Solver = "auto", depth: Depth = 0,
+    solver: Solver = "auto", depth: Depth = "auto",
 ) -> Factorization:  # fmt: skip
     """Prepare a linear problem for many right-hand sides.
 

@@ -218,11 +218,14 @@ class Solution:
             return self._error
         if self._fit is None:
             raise ValueError("error_estimate: this solution was pickled without its problem; ask before pickling")
-        return self._keep(correction(self._fit, self._values))
+        own = getattr(self._fit, "error_estimate", None)  # one of several regions brings its own
+        return self._kept(own(self._values)) if own else self._size(correction(self._fit, self._values))
 
-    def _keep(self, found: Correction) -> Array:
+    def _size(self, found: Correction) -> Array:
         """The size of an estimated error, kept for the next who asks."""
-        error = abs(found.error)[..., 0] if self._recipe.fields == 1 else abs(found.error)
+        return self._kept(abs(found.error)[..., 0] if self._recipe.fields == 1 else abs(found.error))
+
+    def _kept(self, error: Array) -> Array:
         if not is_traced(error, self._values):
             self._error = frozen(error)
             self._share = share(np.reshape(error, np.shape(self._values)), np.asarray(self._values))
@@ -231,8 +234,10 @@ class Solution:
     def correction(self) -> Correction:
         """What the error estimate is made of, for those who refine by it: signed errors, defects and their weights."""
         self.refuse_stacked()
+        if hasattr(self._fit, "error_estimate"):
+            raise ValueError("correction: several regions have an error estimate, but no defects to refine by")
         found = correction(self._fit, self._values)
-        self._keep(found)
+        self._size(found)
         return found
 
     def _estimated(self) -> float:

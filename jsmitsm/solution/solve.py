@@ -15,10 +15,11 @@ from jsmitsm.particle.kernels import Kernel
 from jsmitsm.runtime.arrays import ValueOrFunction
 from jsmitsm.runtime.progress import bar
 from jsmitsm.runtime.tracers import is_traced
-from jsmitsm.solution.arguments import Depth, Formulation, Method, check
+from jsmitsm.solution.arguments import Depth, Formulation, Method, check, of_regions
 from jsmitsm.solution.fit import Fit, Recipe
 from jsmitsm.solution.nonlinear.newton import newton
 from jsmitsm.solution.order_choice import check_tolerance, of_tolerance
+from jsmitsm.solution.regions.solve import solve_regions
 from jsmitsm.solution.run import Run
 from jsmitsm.solution.solution import Solution
 
@@ -31,7 +32,7 @@ def solve(
     method: Method = "S",
     order: int | Literal["auto"] = 4,
     tol: float | None = None,
-    depth: Depth = 0,
+    depth: Depth = "auto",
     kernel: Kernel | None = None,
     stencils: Stencils | None = None,
     basis_terms: int | None = None,
@@ -86,6 +87,11 @@ def solve(
     True
     """
     check_tolerance(order, tol)
+    if of_regions(problem, cloud):
+        return solve_regions(
+            problem, cloud, method=method, order=order, kernel=kernel, stencils=stencils, basis_terms=basis_terms,
+            formulation=formulation, solver=solver, u0=u0, throw=throw, depth=depth,
+        )  # fmt: skip
 
     def solved(order: Any) -> tuple[Solution, Run]:
         run = prepared(
@@ -103,7 +109,7 @@ def solve(
 def prepared(
     problem: Problem, cloud: Cloud, *, method: str = "S", order: int = 4, kernel: Kernel | None = None,
     stencils: Stencils | None = None, basis_terms: int | None = None, formulation: str = "auto", solver: str = "auto",
-    u0: Any = None, throw: bool = True, depth: Depth = 0,
+    u0: Any = None, throw: bool = True, depth: Depth = "auto",
 ) -> Run:  # fmt: skip
     """Checked arguments of :func:`solve`, discretised."""
     start = time.perf_counter()

@@ -29,6 +29,7 @@ from jsmitsm.runtime.jaxprs import (
     derivative,
     levels,
     literal,
+    scan_sizes,
     unsupported,
 )
 from jsmitsm.runtime.tracers import is_traced
@@ -235,17 +236,17 @@ def _promote(ring: Ring, vals: Sequence[Array], batch: int) -> list[Array]:
 def _scan(ring: Ring, eqn: Any, *vals: Array) -> list[Array]:
     p = eqn.params
     body, length = p["jaxpr"], p["length"]
-    fixed, carry = list(vals[: p["num_consts"]]), list(vals[p["num_consts"] :][: p["num_carry"]])
-    rows = vals[p["num_consts"] + p["num_carry"] :]
+    n, m = scan_sizes(p)
+    fixed, carry, rows = list(vals[:n]), list(vals[n : n + m]), vals[n + m :]
     if on_host(*vals) or length * len(body.jaxpr.eqns) <= UNROLL:
         outs: list[list[Array]] = []
         for k in reversed(range(length)) if p["reverse"] else range(length):
             new = evaluate(body.jaxpr, body.consts, [*fixed, *carry, *(r[:, k] for r in rows)], *ring)
-            carry = new[: p["num_carry"]]
-            outs.append(new[p["num_carry"] :])
+            carry = new[:m]
+            outs.append(new[m:])
         outs = outs[::-1] if p["reverse"] else outs
         stacked = []
-        for k, v in enumerate(eqn.outvars[p["num_carry"] :]):
+        for k, v in enumerate(eqn.outvars[m:]):
             parts = unify(*(o[k] for o in outs)) if outs else [np.zeros((1, *v.aval.shape[1:], 1), v.aval.dtype)]
             stack = xp_of(*parts).stack(parts, 1)
             stacked.append(stack if outs else stack[:, :0])
@@ -254,7 +255,7 @@ def _scan(ring: Ring, eqn: Any, *vals: Array) -> list[Array]:
 
     def step(state: list[Array], row: list[Array]) -> tuple[list[Array], list[Array]]:
         new = evaluate(body.jaxpr, body.consts, [*fixed, *state, *row], *ring)
-        return _promote(ring, new[: p["num_carry"]], batch), _promote(ring, new[p["num_carry"] :], batch)
+        return _promote(ring, new[:m], batch), _promote(ring, new[m:], batch)
 
     moved = [jnp.moveaxis(jnp.asarray(r), 1, 0) for r in rows]
     carry, ys = jax.lax.scan(step, _promote(ring, carry, batch), moved, length, p["reverse"])

@@ -25,6 +25,7 @@ from jsmitsm.discretization.supports import scheme_size
 from jsmitsm.equation.problem import Problem
 from jsmitsm.particle.batches import QUICKLY
 from jsmitsm.particle.kernels import EDGE, Kernel, SuperGaussian
+from jsmitsm.runtime.compiler_options import on_cpu
 from jsmitsm.runtime.errors import SolveError
 from jsmitsm.solution.fit import Fit, Recipe
 from jsmitsm.solution.nonlinear.newton import newton
@@ -122,7 +123,7 @@ class Objective:
             try:
                 disc = discretize(
                     self.problem, self.cloud, o["method"], o["order"], wide, self.given, o.get("basis_terms"),
-                    depth=o.get("depth", 0),
+                    depth=o.get("depth", "auto"),
                 )
                 break
             except ValueError as error:
@@ -158,7 +159,7 @@ class Objective:
             graded = jax.value_and_grad(lambda z: self.score(kernel_of(z)), has_aux=True)
             if self.linear and len(self.cloud) <= COMPILED:
                 # A few dozen calls do not repay an optimising compiler, which takes five times as long.
-                graded = jax.jit(graded, compiler_options=QUICKLY if jax.default_backend() == "cpu" else None)
+                graded = jax.jit(graded, compiler_options=on_cpu(QUICKLY))
             self._compiled = {key: graded}
         (score, (value, lebesgue, defect, values, taylor)), slope = self._compiled[key](z)
         defect, values, taylor = jax.tree.map(np.asarray, (defect, values, taylor))

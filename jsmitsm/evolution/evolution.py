@@ -1,0 +1,188 @@
+"""What an evolution returns: saved states, anything between them, and what speaks against them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jsmitsm.cloud.cloud import Cloud
+from jsmitsm.evolution import dense_output
+from jsmitsm.evolution.local_fits import StateFit
+from jsmitsm.runtime.arrays import Array
+from jsmitsm.runtime.tracers import frozen, is_traced
+from jsmitsm.solution.fit import Recipe
+from jsmitsm.solution.solution import Solution
+
+
+@jax.tree_util.register_pytree_node_class
+class Evolution:
+    """A solution in time, at saved moments and between them.
+
+    Attributes
+    ----------
+    t : (S,) the saved times, from the start to the end.
+    u : (S, N) values at the particles, (S, N, F) for a system.
+    rate : the same of du/dt for a problem of second order in time, else None.
+    converged : whether the run reached its end.
+    flags : sentences that speak against it; none for a healthy one.
+    stats : seconds, steps, scheme, factorisations, what was skipped.
+
+    ``at(t)`` is the solution at any time, callable like a :class:`jsmitsm.Solution`. To go on from the end give
+    ``u0=run.u[-1]``, of second order ``u0=(run.u[-1], run.rate[-1])``.
+
+    Examples
+    --------
+    >>> import jax; jax.config.update("jax_enable_x64", True)
+    >>> import jax.numpy as jnp, jsmitsm as js
+    >>> ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(0.0)}
+    >>> heat = js.Problem(lambda u, x, t: js.dt(u)(x) - js.laplacian(u)(x), ends)
+    >>> run = js.evolve(heat, js.interval(0.0, 1.0, 21), lambda x: jnp.sin(jnp.pi * x[0]), t=(0.0, 0.1), steps=20)
+    >>> run
+    Evolution(t: 0 to 0.1, u: 2x21, converged=True)
+    >>> bool(abs(run.at(0.05)([[0.5]])[0] - jnp.exp(-jnp.pi**2 * 0.05)) < 1e-4)
+    True
+    """
+
+    def __init__(self, t, u, rate, cloud, recipe, converged, stats, history=None, report=None, fit=None):
+        self.t = frozen(t)
+        self._u, self._rate = frozen(u), frozen(rate)  # (S, N, F)
+        self.cloud: Cloud = cloud
+        self._recipe: Recipe = recipe
+        self.converged: bool | jax.Array = converged
+        self.stats: dict[str, Any] = stats
+        self._history = history  # times (K,), values (K, N, F): what lies between the saved moments
+        self._report: Report | None = report
+        self._fit = fit
+
+    @property
+    def u(self) -> Array:
+        """Values (S, N), or (S, N, F) for a system."""
+        return self._u[..., 0] if self._recipe.fields == 1 else self._u
+
+    @property
+    def rate(self) -> Array | None:
+        """du/dt at the saved times, of a problem of second order in time."""
+        if self._rate is None:
+            return None
+        return self._rate[..., 0] if self._recipe.fields == 1 else self._rate
+
+    @property
+    def flags(self) -> list[str]:
+        """What speaks against this evolution, a sentence each."""
+        return [] if self._report is None else list(self._report.flags)
+
+    def diagnose(self) -> str:
+        """In words: how the run went."""
+        lines = [repr(self)]
+        if not is_traced(self.converged) and not bool(np.all(self.converged)):
+            lines.append(f"The run did NOT reach its end; the last good state is that of t = {float(self.t[-1]):g}.")
+        lines += [f"FLAG: {line}" for line in self.flags]
+        if self._report is not None:
+            lines += self._report.told
+        s = self.stats
+        if "steps" in s:
+            lines.append(
+                f"{s['steps']} steps of {s['scheme']}"
+                + (f", {s['rejected']} more rejected" if s.get("rejected") else "")
+                + f", {s.get('factorisations', 0)} factorisation(s)."
+            )
+        if s.get("error_in_time") is not None:
+            lines.append(f"The estimated error in time is {s['error_in_time']:.1e} of the solution.")
+        return "\n".join(lines)
+
+    def at(self, t: Any) -> Solution:
+        """The solution at the time ``t`` (a number): values anywhere, gradients, integrals.
+
+        Between the steps of the run by the polynomial in t through the six nearest of them. Raises ValueError for
+        times outside of the run.
+        """
+        if is_traced(self._u) or jnp.ndim(self._u) != 3:
+            raise ValueError("at: inside of a JAX transform, or of a stack made by jax.vmap, only .t and .u can be read")
+        try:
+            time = float(t)
+        except (TypeError, ValueError):
+            raise ValueError(f"t: expected a number, got {t!r}") from None
+        times, values = (np.asarray(self.t), np.asarray(self._u)) if self._history is None else self._history
+        slack = 1e-12 * (times[-1] - times[0])
+        if not times[0] - slack <= time <= times[-1] + slack:
+            raise ValueError(f"t: {time:g} is outside of the run, from {times[0]:g} to {times[-1]:g}")
+        index, weights = dense_output.weights(times, np.array([time]))
+        u = np.tensordot(weights[0], np.asarray(values)[index[0]], axes=1)
+        return self._solution(u, time)
+
+    def _solution(self, u: np.ndarray, time: float) -> Solution:
+        stats = {"messages": [f"The state at t = {time:g} of an evolution."]}
+        if self._fit is None:
+            self._fit = StateFit(self.cloud, self._recipe.reach)
+        return Solution(u, self.cloud, self._recipe, self._fit, self.converged, 1, stats)
+
+    def error_estimate(self) -> Array:
+        """Estimated error at every particle and saved time, (S, N) or (S, N, F).
+
+        In space by the defect that a pencil of order p + 2 finds, in time by the embedded scheme. Computed when asked
+        for. Raises ValueError for what came out of a JAX transform or a pickle.
+        """
+        if self._report is None:
+            raise ValueError(
+                "error_estimate: this evolution came out of a JAX transform or a pickle; ask outside, before pickling"
+            )
+        found = self._report.estimate()
+        return found[..., 0] if self._recipe.fields == 1 else found
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+    def __repr__(self) -> str:
+        shape = "x".join(map(str, self.u.shape))
+        if is_traced(self.t, self.converged):
+            return f"Evolution(u: {shape})"
+        ends = f"t: {float(np.min(self.t)):g} to {float(np.max(self.t)):g}"
+        return f"Evolution({ends}, u: {shape}, converged={bool(np.all(self.converged))})"
+
+    def to_xarray(self) -> Any:
+        """The saved states as an ``xarray.Dataset`` with the dimensions time, particle (and field).
+
+        Raises ImportError where xarray is not installed.
+        """
+        try:
+            import xarray
+        except ImportError:
+            raise ImportError("to_xarray: it needs the package xarray; pip install xarray") from None
+        dims = ("time", "particle", "field")[: np.ndim(self.u)]
+        points = np.asarray(self.cloud.points)
+        places = {name: ("particle", points[:, k]) for k, name in zip(range(points.shape[1]), "xyz")}
+        data = {"u": (dims, np.asarray(self.u))}
+        if self.rate is not None:
+            data["rate"] = (dims, np.asarray(self.rate))
+        return xarray.Dataset(data, {"time": np.asarray(self.t), **places})
+
+    def tree_flatten(self):
+        return (self.t, self._u, self._rate, self.cloud, self.converged), self._recipe
+
+    @classmethod
+    def tree_unflatten(cls, recipe, leaves):
+        new = object.__new__(cls)
+        new.t, new._u, new._rate, new.cloud, new.converged = leaves
+        new._recipe, new.stats, new._history, new._report = recipe, {}, None, None
+        new._fit = None
+        return new
+
+    def __getstate__(self):
+        return {**self.__dict__, "_report": None, "_fit": None}
+
+
+class Report:
+    """What a run can still say of itself when asked: its flags, and an estimate of its error."""
+
+    def __init__(self, flags: list[str], told: list[str], estimate: Callable[[], Any]):
+        self.flags, self.told = flags, told
+        self._estimate, self._found = estimate, None
+
+    def estimate(self) -> Any:
+        if self._found is None:
+            self._found = frozen(self._estimate())
+        return self._found

@@ -1,0 +1,121 @@
+"""Evolve a problem in time: the verb."""
+
+from __future__ import annotations
+
+import time
+from typing import Any, Literal
+
+from jsmitsm.cloud.cloud import Cloud
+from jsmitsm.cloud.neighbours import Stencils
+from jsmitsm.equation.problem import Problem
+from jsmitsm.evolution.arguments import Scheme, check, saved_times, starting_values
+from jsmitsm.evolution.evolution import Evolution
+from jsmitsm.evolution.march import march
+from jsmitsm.evolution.run import Run
+from jsmitsm.evolution.timed import timed
+from jsmitsm.runtime.arrays import ValueOrFunction
+from jsmitsm.runtime.progress import bar
+from jsmitsm.runtime.tracers import is_traced
+from jsmitsm.solution.arguments import Depth
+
+
+def evolve(
+    problem: Problem,
+    cloud: Cloud,
+    u0: ValueOrFunction | tuple[ValueOrFunction, ValueOrFunction],
+    t: tuple[float, float],
+    *,
+    steps: int | None = None,
+    tol: float | None = None,
+    order: int = 4,
+    scheme: Scheme = "auto",
+    save: int | Any = None,
+    damping: float | Literal["auto"] = "auto",
+    stencils: Stencils | None = None,
+    depth: Depth = "auto",
+    throw: bool = True,
+    progress: bool = True,
+) -> Evolution:
+    """Evolve ``problem`` on ``cloud`` from ``u0`` over the times ``t``.
+
+    The functions of the problem take the time: ``pde(u, x, t)``, in which ``js.dt(u)(x)`` and ``js.dt(u, 2)(x)`` are
+    the rates of u; values of conditions ``(x, t)``; residuals of conditions ``(u, x, t)`` or ``(u, x, n, t)``; each
+    with ``params`` last where the problem has them. Rates enter linearly, with factors that may depend on x. An
+    equation without a rate holds at every moment.
+
+    Parameters
+    ----------
+    u0 : the start, a function of x, a number or an array (N,) or (N, F); for second order in time a pair of them, u
+        and its rate. Where it differs from the conditions the run begins with the impulse that this is.
+    t : (t0, t1), the start and the end.
+    steps : so many equal steps; or
+    tol : steps whose estimated error, relative to the largest value so far, stays below it.
+    order : of the discretization in space, the degree of the fits.
+    scheme : "esdirk" (KenCarp4, order 4), "radau" (Radau IIA, order 5, for linear problems), "imex" (KenCarp4 with
+        its explicit half for what is nonlinear), "euler" (backward), or "auto": radau for linear problems of order 6
+        and more, of second order in time, and with equations without a rate, esdirk for other linear ones; imex for
+        semilinear ones, where only lower derivatives are nonlinear, and esdirk with Newton's method for the rest.
+    save : so many equal intervals, or an array of times; the start and the end alone if not given.
+    damping : for waves, a small multiple of what only the cloud sees: alpha / spacing times the rate minus its
+        prediction by the neighbours. "auto" is 0.1 at order 6 and above, 0 below; for pairs of fields that drive one
+        another by second derivatives, as in Schroedinger's equation, 0.2.
+    stencils : the user's, from :func:`jsmitsm.stencils`, which are not repaired; needed where JAX traces the points.
+    depth : degrees by which the recursion exceeds the order; "auto" is 0, since more gains nothing here.
+    throw : raise :class:`jsmitsm.SolveError` where the run cannot go on; otherwise return the last good state, with
+        ``converged`` False.
+    progress : a bar with the time and an estimate of the rest.
+
+    Raises
+    ------
+    ValueError
+        For bad input, and for problems that this cannot do: pure advection, conditions nonlinear in u.
+    SolveError
+        For a run that blew up, a stage that did not converge, steps that became too small.
+
+    Notes
+    -----
+    The source is a field given at the particles: space is one pencil A u = B f, made once, and a step size is one
+    factorisation. Differentiable by ``jax.grad`` with respect to params, u0, t and what the functions close over;
+    under ``jax.jit`` and ``jax.vmap`` with ``steps`` only.
+
+    Examples
+    --------
+    >>> import jax; jax.config.update("jax_enable_x64", True)
+    >>> import jax.numpy as jnp, jsmitsm as js
+    >>> cloud = js.interval(0.0, 1.0, 31)
+    >>> problem = js.Problem(
+    ...     lambda u, x, t, k: js.dt(u)(x) - k * js.laplacian(u)(x),
+    ...     {"left": js.dirichlet(0.0), "right": js.neumann(0.0)},
+    ...     params=0.5,
+    ... )
+    >>> run = js.evolve(problem, cloud, lambda x: jnp.sin(jnp.pi * x[0] / 2), t=(0.0, 1.0), steps=20, order=6, save=4)
+    >>> run.u.shape, run.t.tolist(), run.flags
+    ((5, 31), [0.0, 0.25, 0.5, 0.75, 1.0], [])
+    >>> bool(abs(run.u[-1, -1] - jnp.exp(-jnp.pi**2 / 8)) < 1e-8)
+    True
+    """
+    began = time.perf_counter()
+    check(problem, cloud, t, steps, tol, order, scheme, throw, progress)
+    made = timed(problem, cloud)
+    second = bool(made.masses[1].slots)
+    start = starting_values(u0, cloud, problem.fields, second)
+    options = {"order": int(order), "scheme": scheme, "damping": damping, "stencils": stencils, "throw": throw,
+               "depth": 0 if depth == "auto" else depth}  # fmt: skip
+    run = Run(made, cloud, start, t, began, **options)
+    if is_traced(t):
+        if not (save is None or isinstance(save, int)):
+            raise ValueError("save: where t is traced by JAX, give a number of intervals instead of times")
+        parts = saved_times(save, 0.0, 1.0)
+    else:
+        parts = saved_times(save, float(t[0]), float(t[1]))
+    if run.traced:
+        if steps is None:
+            raise ValueError(
+                "tol: under a JAX transform the steps must be known; give steps=, as many as a run with tol took"
+            )
+        return differentiable(run, int(steps), parts)
+    total = int(steps) if steps is not None else 1000
+    with bar("evolve", total, wanted=progress) as shown:
+        return march(run, None if steps is None else int(steps), None if tol is None else float(tol), parts, shown)
+
+

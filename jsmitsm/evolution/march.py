@@ -1,0 +1,255 @@
+"""The steps of a run on the host, and what is said of them afterwards."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+
+from jsmitsm.evolution import dense_output
+from jsmitsm.evolution.control import controlled
+from jsmitsm.evolution.estimate import estimated
+from jsmitsm.evolution.evolution import Evolution, Report
+from jsmitsm.evolution.local_fits import StateFit
+from jsmitsm.evolution.run import Run
+from jsmitsm.evolution.semidiscrete import local_fits
+from jsmitsm.evolution.stepping import Step, Stopped
+from jsmitsm.runtime.errors import SolveError
+from jsmitsm.solution.fit import Recipe
+from jsmitsm.taylor.multi_indices import HIGHEST
+
+# Bytes of states that are kept for what lies between the saved ones.
+HISTORY = 2**29
+# Growth of the largest value that no problem means.
+BLOWN = 1e30
+# Steps of a run with equal ones whose error in time is estimated.
+LOOKS = 8
+# An estimated error in time above this part of the solution is a flag.
+LARGE = 0.02
+
+
+class History:
+    """The states of a run: all of them, or where they would be too many those next to the saved times."""
+
+    def __init__(self, run: Run, wanted: np.ndarray | None):
+        self.run, self.wanted = run, wanted
+        self.times: list[float] = []
+        self.states: list[np.ndarray] = []
+        self.rates: list[np.ndarray] = []
+        self.scale = 0.0
+
+    def add(self, t: float, step: Step, number: int | None = None) -> None:
+        semi = self.run.semi
+        part = step.y[: semi.system.n]
+        self.scale = max(self.scale, float(np.abs(part).max(initial=0.0)))
+        if self.wanted is not None and number is not None and not self.wanted[number]:
+            return
+        self.times.append(t)
+        self.states.append(semi.placed(part, step.known))
+        if semi.second:
+            rates = semi.sample(np.asarray(float(t)))[3]
+            self.rates.append(semi.placed(step.y[semi.system.n :], np.asarray(rates)))
+
+    def at(self, times: np.ndarray, of: list[np.ndarray]) -> np.ndarray:
+        index, weights = dense_output.weights(np.array(self.times), times)
+        return np.stack([np.tensordot(w, np.stack([of[i] for i in k]), axes=1) for k, w in zip(index, weights)])
+
+
+def march(run: Run, steps: int | None, tol: float | None, parts: np.ndarray, shown: Any) -> Evolution:
+    """All steps, and the Evolution that they make."""
+    t0, t1 = (float(v) for v in run.t)
+    began = time.perf_counter()
+    wanted = None
+    if steps is not None and 8 * (steps + 1) * len(run.cloud) * run.fields > HISTORY:
+        wanted = np.zeros(steps + 1, bool)
+        wanted[dense_output.weights(np.linspace(0.0, 1.0, steps + 1), parts)[0]] = True
+    history = History(run, wanted)
+    fault, errors = "", []
+    try:
+        y = started(run, (t1 - t0) / (steps or 64))
+        if steps is None:
+            assert tol is not None
+            _adaptive(run, y, t0, t1, tol, history, shown)
+        else:
+            errors = _equal(run, y, np.linspace(t0, t1, steps + 1), history, shown)
+    except Stopped as stopped:
+        fault = str(stopped)
+    if fault and run.throw:
+        raise SolveError(f"the run stopped: {fault}; give throw=False for the last good state", [])
+    return _finished(run, parts, history, fault, errors, began)
+
+
+def started(run: Run, h: float) -> np.ndarray:
+    """The state at the start: the impulse of a start that contradicts the conditions, and equations without rates."""
+    semi, t0 = run.semi, float(run.t[0])
+    flat = [np.asarray(v).reshape(-1) for v in run.start]
+    y = np.concatenate([v[semi.free] for v in flat])
+    force, held = _now(run, t0)
+    asked = semi.masses_held[-1].host @ flat[-1][semi.held]
+    jump = semi.system.force(asked) - held
+    scale = max(float(np.abs(v).max(initial=0.0)) for v in flat)
+    gap = np.abs(flat[0][semi.held] - np.asarray(semi.sample(np.asarray(t0))[0])).max(initial=0.0)
+    still = semi.system.undriven()
+    small = 1e-7 * h
+    if run.algebraic:  # a vanishing step of backward Euler settles what holds at every moment
+        return semi.system.resolvent(small).solve(semi.system.mass(y) + jump + small * force)
+    if not semi.second and gap > 1e-13 * scale and semi.masses_held[-1].values.size:
+        if still.any():
+            return semi.system.resolvent(small).solve(semi.system.mass(y) + jump + small * force)
+        return y + semi.system.resolvent(0.0).solve(jump)
+    return y
+
+
+def _now(run: Run, t: float) -> tuple[np.ndarray, np.ndarray]:
+    samples = run.semi.samples(np.array([t]))
+    force, held = run.semi.forces(*samples)
+    explicit = 0.0 if run.semi.linear else run.semi.explicit(started_raw(run), t, samples[0][:, 0])
+    return force[0] + explicit, held[0]
+
+
+def started_raw(run: Run) -> np.ndarray:
+    """The state as it was given."""
+    return np.concatenate([np.asarray(v).reshape(-1)[run.semi.free] for v in run.start])
+
+
+def _equal(run: Run, y: np.ndarray, times: np.ndarray, history: History, shown: Any) -> list[float]:
+    """Equal steps; the estimated errors of some of them, relative to the solution."""
+    h = float(times[-1] - times[0]) / (len(times) - 1)
+    stepper = run.stepper(run.semi)
+    stepper.drive.plan(times[:-1], h)
+    step = stepper.first(y, float(times[0]))
+    history.add(float(times[0]), step, 0)
+    looks = {round(k) for k in np.linspace(0, len(times) - 2, LOOKS)}
+    errors = []
+    for k in range(len(times) - 1):
+        if run.timed.quasilinear and run.drifted(step.y, float(times[k])):
+            run.renew(step.y, float(times[k]))
+            stepper = run.stepper(run.semi)
+            step = stepper.first(step.y, float(times[k]))
+        step = _one(run, stepper, step, float(times[k]), h, k in looks)
+        history.add(float(times[k + 1]), step, k + 1)
+        if step.error is not None:
+            errors.append(_size(run, step.error, history.scale))
+        _refuse_growth(history, step, float(times[k + 1]))
+        run.counts["steps"] += 1
+        shown.update()
+    return errors
+
+
+def _one(run: Run, stepper: Any, step: Step, t: float, h: float, look: bool) -> Step:
+    try:
+        return stepper.advance(step, t, h, look)
+    except SolveError as fault:
+        raise Stopped(f"the stage's system at t = {t:.6g} cannot be solved: {fault}") from fault
+
+
+def _refuse_growth(history: History, step: Step, t: float) -> None:
+    first = max(float(np.abs(history.states[0]).max(initial=0.0)), 1.0)
+    if history.scale > BLOWN * first:
+        raise Stopped(
+            f"the solution blew up: it is {history.scale:.1e} at t = {t:.6g}; take more steps, or, where the equation "
+            "itself grows so fast, an earlier end"
+        )
+
+
+def _size(run: Run, error: np.ndarray, scale: float) -> float:
+    part = error[: run.semi.system.n]
+    return float(np.abs(part).max(initial=0.0)) / (scale or 1.0)
+
+
+def _adaptive(run: Run, y: np.ndarray, t0: float, t1: float, tol: float, history: History, shown: Any) -> None:
+    if run.name == "euler":
+        raise ValueError('tol: backward Euler has no estimate of its error; use steps, or scheme="esdirk"')
+    done = 0
+
+    def tell(part: float) -> None:
+        nonlocal done
+        new = int(1000 * part)
+        shown.update(new - done)
+        done = new
+
+    stepper: Any = _Renewing(run)
+    counts = controlled(
+        stepper, y, t0, t1, tol, lambda t, step: history.add(t, step), tell,
+        lambda error: _size(run, error, history.scale),
+    )  # fmt: skip
+    run.counts.update(counts)
+
+
+class _Renewing:
+    """Steps of a run whose pencil may have to be made anew on the way."""
+
+    def __init__(self, run: Run):
+        self.run, self.inner = run, run.stepper(run.semi)
+        self.order = self.inner.order
+
+    def first(self, y: np.ndarray, t: float) -> Step:
+        return self.inner.first(y, t)
+
+    def advance(self, last: Step, t: float, h: float, estimate: bool) -> Step:
+        run = self.run
+        if run.timed.quasilinear and run.drifted(last.y, t):
+            run.renew(last.y, t)
+            self.inner = run.stepper(run.semi)
+            last = self.inner.first(last.y, t)
+        return self.inner.advance(last, t, h, estimate)
+
+
+def _finished(run: Run, parts: np.ndarray, history: History, fault: str, errors: list[float], began: float) -> Evolution:
+    t0, t1 = (float(v) for v in run.t)
+    times = np.where(parts >= 1.0, t1, t0 + parts * (t1 - t0))
+    flags, told = run.flags, run.told
+    if fault:
+        last = history.times[-1] if history.times else t0
+        times = np.append(times[times < last - 1e-12 * (t1 - t0)], last)
+        flags.insert(0, f"FAILED: {fault}.")
+    if not history.times:
+        states = np.asarray(run.start[0])[None]
+        rates = np.asarray(run.start[1])[None] if run.second else None
+        history.times, history.states = [t0], list(states)
+        times = np.array([t0])
+    elif len(history.times) == 1:
+        states, rates = np.stack(history.states), np.stack(history.rates) if run.second else None
+    else:
+        states = history.at(times, history.states)
+        rates = history.at(times, history.rates) if run.second else None
+    # Errors of the steps add up at the worst.
+    in_time = float(np.mean(errors)) * run.counts["steps"] if errors else None
+    if in_time is not None and in_time > LARGE:
+        flags.append(f"The estimated error in time is {in_time:.0%} of the solution: take more steps, or a tol.")
+    stats = _statistics(run, began, in_time)
+    disc = run.semi.disc
+    degree = min(run.order + 2, HIGHEST)
+    recipe = Recipe("S", run.order, None, "loo", run.fields, degree - run.order)
+    fit = StateFit(run.cloud, degree, lambda: local_fits(disc, degree))
+    kept = np.array(history.times), np.stack(history.states)
+    report = Report(flags, told, lambda: estimated(run, np.asarray(times), kept, in_time))
+    return Evolution(times, states, rates, run.cloud, recipe, not fault, stats, kept, report, fit)
+
+
+def _statistics(run: Run, began: float, in_time: float | None) -> dict[str, Any]:
+    names = {"esdirk": "KenCarp4", "imex": "KenCarp4, implicit and explicit", "radau": "Radau IIA 5",
+             "euler": "backward Euler"}  # fmt: skip
+    end = time.perf_counter()
+    counts = run.counts
+    made = run.semi.system.factorisations + (run.newton.counts["factorisations"] if run.newton else 0)
+    skipped = []
+    if run.semi.timed.steady:
+        skipped.append("data that do not change in time were looked at once")
+    return {
+        "scheme": names[run.name],
+        "steps": counts["steps"],
+        "rejected": counts["rejected"],
+        "factorisations": made,
+        "pencils": counts["pencils"],
+        "iterations": run.newton.counts["iterations"] if run.newton else 0,
+        "unknowns": run.semi.system.size,
+        "particles": len(run.cloud),
+        "damping": run.damping,
+        "depth": run.depth,
+        "error_in_time": in_time,
+        "skipped": skipped,
+        "seconds": {"pencil": counts["seconds in pencils"], "steps": end - began, "total": end - run.began},
+        "messages": list(run.told),
+    }

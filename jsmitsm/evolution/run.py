@@ -1,0 +1,173 @@
+"""A run before its first step: the scheme, the damping, the pencil, the start."""
+
+from __future__ import annotations
+
+import time
+from contextlib import nullcontext
+from typing import Any
+
+import jax
+import numpy as np
+
+from jsmitsm.cloud.cloud import Cloud
+from jsmitsm.discretization.coefficients import slot_series
+from jsmitsm.discretization.layout import discretize
+from jsmitsm.discretization.pencil.assemble import assemble_pencil
+from jsmitsm.equation.field import RATE
+from jsmitsm.evolution.convection import refuse_convection
+from jsmitsm.evolution.newton import Newton
+from jsmitsm.evolution.semidiscrete import Driver, Semidiscrete, local_fits
+from jsmitsm.evolution.stepping import RadauStepper, Stepper
+from jsmitsm.evolution.tableaux import EULER, KENCARP4, RADAU
+from jsmitsm.evolution.timed import Timed
+from jsmitsm.runtime.tracers import is_traced
+
+# A quasilinear problem is linearised anew where its coefficients have changed by this part of themselves.
+DRIFT = 0.1
+
+
+class Run:
+    """A run of one problem on one cloud."""
+
+    def __init__(self, timed: Timed, cloud: Cloud, start: tuple[Any, ...], t: Any, began: float, *, order: int,
+                 scheme: str, damping: Any, stencils: Any, throw: bool, depth: int):  # fmt: skip
+        self.timed, self.cloud, self.start, self.t, self.began = timed, cloud, start, t, began
+        self.order, self.stencils, self.throw, self.depth = order, stencils, throw, depth
+        self.params = timed.problem.params[1]
+        self.traced = is_traced(self.params, start, t, cloud, timed.problem, timed.rest, timed.masses)
+        self.fields = timed.problem.fields
+        self.second = bool(timed.masses[1].slots)
+        self.flags: list[str] = []
+        self.told: list[str] = []
+        self.counts: dict[str, Any] = {"steps": 0, "rejected": 0, "pencils": 0}
+        self.newton: Newton | None = None
+        self._fits: Any = None
+        self.name = self._scheme(scheme)
+        self.damping = self._damping(damping)
+        if self.traced and (timed.quasilinear or self.name in ("radau",)):
+            raise ValueError(
+                'scheme: under a JAX transform js.evolve steps by "esdirk" and "euler" where the problem is linear, and '
+                'by "imex" where only lower derivatives are nonlinear'
+            )
+        self.semi = self.pencil(np.asarray(0.0) if self.traced else np.asarray(float(t[0])), start[0])
+
+    # ------------------------------------------------------------------ what is chosen
+
+    @property
+    def algebraic(self) -> bool:
+        """Whether a field has no rate."""
+        moved = {k for m in self.timed.masses for k, _ in m.slots}
+        return len({k % RATE for k in moved}) < self.fields
+
+    def _scheme(self, asked: str) -> str:
+        timed = self.timed
+        if asked == "radau" and not timed.linear:
+            raise ValueError(
+                'scheme: "radau" serves linear problems, and this one is nonlinear, or its operator depends on t; use '
+                '"imex" or "esdirk"'
+            )
+        if asked == "imex" and timed.quasilinear:
+            raise ValueError(
+                'scheme: "imex" takes what is nonlinear explicitly, and here the highest derivatives are nonlinear or '
+                'their coefficients depend on t; use "esdirk"'
+            )
+        if self.second and not timed.linear and asked in ("esdirk", "euler"):
+            raise ValueError(
+                f'scheme: {asked!r} solves linear problems of second order in time; use "imex", or write two fields of '
+                "first order"
+            )
+        if self.second and timed.quasilinear:
+            raise ValueError(
+                "pde: of second order in time and with nonlinear (or time-dependent) highest derivatives, which "
+                "js.evolve does not do; write two fields of first order"
+            )
+        if asked != "auto":
+            return asked
+        if timed.linear:
+            return "radau" if (self.order >= 6 or self.second or self.algebraic) and not self.traced else "esdirk"
+        return "esdirk" if timed.quasilinear or self.algebraic else "imex"
+
+    def _damping(self, asked: Any) -> float:
+        """The factor of the damping matrix."""
+        operator = self.timed.problem.pde
+        coupled = not self.second and self.fields > 1 and all(
+            not any(p and k == e and sum(b) == operator.order[e] for (k, b), p in zip(operator.slots, row))
+            for e, row in enumerate(operator.pattern)
+        )  # fmt: skip
+        if isinstance(asked, str) and asked == "auto":
+            if self.second:
+                alpha = 0.1 if self.order >= 6 else 0.0
+            else:
+                alpha = 0.2 if coupled and max(operator.order) >= 2 and not self.algebraic else 0.0
+        else:
+            good = isinstance(asked, (int, float, np.number)) and not isinstance(asked, bool)
+            if not good or not 0 <= float(asked) < np.inf:
+                raise ValueError(f'damping: expected "auto" or a number from 0, got {asked!r}')
+            alpha = float(asked)
+        if not alpha or is_traced(self.cloud.points):
+            return 0.0
+        points = np.asarray(self.cloud.points)
+        spacing = float((np.prod(np.ptp(points, axis=0)) / len(points)) ** (1.0 / points.shape[1]))
+        return alpha / spacing if self.second else alpha / spacing**2
+
+    def pencil(self, t: Any, u: Any) -> Semidiscrete:
+        """The semidiscrete equations, linearised at the values u (N, F) where the problem is quasilinear."""
+        timed, began = self.timed, time.perf_counter()
+        massed = np.zeros(self.fields, bool)
+        for record in (*timed.masses, timed.rest):
+            massed |= record.pattern.any(axis=1) if record.slots else record.source != "zero"
+        problem = timed.at(t, self.params)
+        self.counts["pencils"] += 1
+        options: dict[str, Any] = {"order": self.order, "mass": massed, "stencils": self.stencils, "depth": self.depth}
+        reference = None
+        if not timed.quasilinear:
+            known = not is_traced(problem, self.cloud, timed.masses)
+            with jax.ensure_compile_time_eval() if known else nullcontext():  # under jit, too, what is known is computed
+                pencil = assemble_pencil(problem, self.cloud, **options)
+        else:
+            problem.pde = timed.space  # type: ignore[assignment]
+            taylor = self._expansions(problem, u)
+            pencil = assemble_pencil(problem, self.cloud, taylor=taylor, **options)
+            rec = pencil.layout.disc.rec
+            slots = slot_series(rec, timed.space.slots, taylor, 0)
+            jac, _ = timed.space.coefficients(self.cloud.points, 0, params=problem.params, slots=slots)
+            reference = np.broadcast_to(jac[:, :, 0], (self.fields, len(timed.space.slots), len(self.cloud)))
+        semi = Semidiscrete(timed, pencil, self.params, self.damping, reference)
+        if not self.traced:
+            refuse_convection(semi, self.flags)
+        self.told = list(pencil.health)
+        self.counts["seconds in pencils"] = self.counts.get("seconds in pencils", 0.0) + time.perf_counter() - began
+        return semi
+
+    def _expansions(self, problem: Any, u: Any) -> Any:
+        """Local polynomials (N, F, K) of the values a problem is linearised at."""
+        if self._fits is None:
+            disc = discretize(problem, self.cloud, "S", self.order, None, self.stencils, None, depth=self.depth)
+            self._fits = local_fits(disc, disc.rec.reach)
+        return self._fits.coefficients(u)
+
+    def drifted(self, y: Any, t: float) -> bool:
+        """Whether the coefficients have left those that the pencil was made with."""
+        semi, record = self.semi, self.timed.space
+        change = semi.steepness(semi.lifted(y, np.asarray(t)), t)
+        for e, m in enumerate(record.order):
+            top = [s for s, (_, b) in enumerate(record.slots) if record.pattern[e, s] and sum(b) == m]
+            size = np.sqrt((semi.reference[e, top] ** 2).sum(axis=0))
+            if (np.abs(change[e, top]).max(axis=0) > DRIFT * size).any():
+                return True
+        return False
+
+    def renew(self, y: Any, t: float) -> None:
+        """The pencil linearised at a later state."""
+        self.semi = self.pencil(np.asarray(t), self.semi.lifted(y, np.asarray(t)))
+
+    def stepper(self, semi: Semidiscrete) -> Any:
+        consistent = not semi.second
+        if self.name == "radau":
+            return RadauStepper(semi.system, Driver(semi, RADAU.sampling(consistent)))
+        scheme = EULER if self.name == "euler" else KENCARP4
+        explicit = None if semi.linear else semi.explicit
+        if self.name != "imex" and explicit is not None:
+            self.newton = Newton(semi)
+        return Stepper(semi.system, Driver(semi, scheme.sampling(consistent)), scheme, explicit,
+                       None if self.name == "imex" else self.newton)  # fmt: skip

@@ -1,0 +1,199 @@
+"""Eigenvalues of an operator on a cloud: the verb."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from jsmitsm.cloud.cloud import Cloud
+from jsmitsm.cloud.neighbours import Stencils
+from jsmitsm.discretization.layout import Discretization
+from jsmitsm.discretization.pencil.assemble import Pencil, assemble_pencil
+from jsmitsm.equation.problem import Problem
+from jsmitsm.modes.estimate import errors
+from jsmitsm.modes.modes import Modes
+from jsmitsm.modes.question import Question, masses, reduced
+from jsmitsm.modes.spectrum import in_real_numbers, modes, normalised, pairs
+from jsmitsm.runtime.arrays import ValueOrFunction
+from jsmitsm.runtime.errors import SolveError, short
+from jsmitsm.runtime.progress import bar
+from jsmitsm.runtime.tracers import concrete, is_traced
+from jsmitsm.solution.arguments import Depth, check
+
+# A condition's value or a source up to this part of what it stands beside is rounding.
+_NOTHING = 1e-12
+
+
+@bar("eigen")
+def eigen(
+    problem: Problem,
+    cloud: Cloud,
+    count: int,
+    *,
+    near: float = 0.0,
+    mass: ValueOrFunction | None = None,
+    method: str = "S",
+    order: int = 6,
+    depth: Depth = 0,
+    stencils: Stencils | None = None,
+    throw: bool = True,
+) -> Modes:
+    """Eigenvalues and modes: numbers lambda and functions u with L u = lambda mass u, and homogeneous conditions.
+
+    L is the residual as it is written: with ``-js.laplacian(u)(x)`` the values are positive. The source's Taylor
+    coefficients are fitted to its values, which makes of the rows of method S a pencil A u = lambda B mass u of their
+    full order; kin: compact (Mehrstellen) schemes.
+
+    Parameters
+    ----------
+    problem : linear, without a source, its conditions homogeneous: of zero value. Of any order and number of fields, in
+        1D, 2D and 3D; periodic pairs too.
+    count : how many values. A multiple one is returned whole, so there may be more; not under ``jax.jit``, where the
+        number must be known.
+    near : a real number; the values nearest to it are found.
+    mass : a number, an array (F,), or a function of x (and of the problem's params, where it takes two arguments),
+        scalar or (F,); 1 if not given. Equation k has the mass times field k on its right-hand side; zero for an
+        equation without it.
+    method : "S", the only one whose rows know their source.
+    order : the degree of the expansions. Errors of values fall as the spacing to the power of the order, or faster.
+    depth : degrees beyond the order of the recursion and of the fit of the source. "auto" is 0: more takes wider
+        stencils and gained nothing.
+    stencils : from :func:`jsmitsm.stencils`; needed where JAX traces the points.
+    throw : raise where the values are not found; otherwise ``converged`` is False.
+
+    Returns
+    -------
+    Modes
+        ``.values`` (k,), ``.u`` (N, k) or (N, k, F), ``modes(j, points)``, ``.error_estimate()`` (k,), ``.flags``.
+        Values and modes are differentiable with respect to params, points and whatever the pde closes over; values of
+        a cluster with the derivative of their mean, modes of simple values only.
+
+    Raises
+    ------
+    ValueError
+        For bad input, with the argument, what came, what was expected and what to do.
+    SolveError
+        Where the values are not found.
+
+    Examples
+    --------
+    >>> import jax; jax.config.update("jax_enable_x64", True)
+    >>> import jsmitsm as js
+    >>> ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(0.0)}
+    >>> string = js.Problem(lambda u, x: -js.laplacian(u)(x), ends)
+    >>> modes = js.eigen(string, js.interval(0.0, 1.0, 41), 3)
+    >>> [round(float(value) ** 0.5 / 3.14159265, 6) for value in modes.values]
+    [1.0, 2.0, 3.0]
+    """
+    start = time.perf_counter()
+    check(problem, cloud, "S", order, None, stencils, throw=throw, depth=depth)
+    _check(problem, count, near, method)
+    weights, massed = masses(problem, cloud, mass)
+    pencil = assemble_pencil(problem, cloud, order=order, mass=tuple(massed), stencils=stencils, depth=depth)
+    disc = pencil.layout.disc
+    _refuse_data(disc, pencil)
+    fields = problem.fields
+    local = time.perf_counter()
+    pattern, a, c = reduced(pencil, weights)
+    with_mass = int(massed[pencil.free % fields].sum())
+    if count > with_mass:
+        raise ValueError(
+            f"count: {count} values asked for, but only {with_mass} of the {len(cloud)} particles' values have an "
+            "equation with a mass; ask for fewer (a tenth of them is resolved well), or refine the cloud"
+        )
+    question = Question(
+        problem, mass, float(near), order, 0 if depth == "auto" else int(depth), pencil, weights, massed
+    )
+    size = float(len(cloud))
+    known_a, known_c = (concrete(x) for x in (a, c))
+    if known_a is None or known_c is None:
+        values, right, *_ = modes(pattern, a, c, float(near), int(count), size)
+        return _finished(question, values, right, jnp.isfinite(values).all(), None, {})
+    try:
+        found = pairs(pattern, np.asarray(known_a), np.asarray(known_c), float(near), int(count), True)
+    except SolveError:
+        if throw:
+            raise
+        nothing = np.full((len(pencil.free), count), np.nan)
+        return _finished(question, nothing[0], nothing, False, None, {})
+    if is_traced(a, c):
+        values, right, *_ = modes(pattern, a, c, float(near), len(found.values), size)
+        return _finished(question, values, right, True, None, {})
+    small = np.abs(found.values.imag) <= 1e-12 * np.abs(found.values)
+    if not small.all():
+        # Parts of a double value may come as a complex pair, whose imaginary part is an error.
+        small = np.abs(found.values.imag) <= np.maximum(errors(question, found), 1e-10 * np.abs(found.values))
+    found = normalised(in_real_numbers(found, small), size)
+    ended = time.perf_counter()
+    stats = {
+        "particles": len(cloud), "unknowns": pattern.n, "depth": question.depth,
+        "neighbours": max(cls.neighbours.shape[1] for cls, _ in pencil.layout.classes),
+        "seconds": {"local": local - start, "modes": ended - local, "total": ended - start},
+    }  # fmt: skip
+    return _finished(question, found.values, found.right, True, found, stats)
+
+
+def _finished(question: Question, values: Any, right: Any, good: Any, found: Any, stats: dict[str, Any]) -> Modes:
+    """The modes on all particles: zero where values are held, a partner's value where it lends it."""
+    pencil = question.pencil
+    disc = pencil.layout.disc
+    xp = jnp if is_traced(right) else np
+    shape = (*disc.held.shape, right.shape[1])
+    if is_traced(right):
+        whole: Any = jnp.zeros((disc.held.size, right.shape[1])).at[pencil.free].set(right)
+    else:
+        right = np.asarray(right)
+        whole = np.zeros((disc.held.size, right.shape[1]), right.dtype)
+        whole[pencil.free] = right
+    u = xp.swapaxes(whole.reshape(shape)[disc.partner], 1, 2)  # (N, k, F)
+    return Modes(values, u, disc.cloud, good, stats, question, found)
+
+
+def _check(problem: Problem, count: Any, near: Any, method: Any) -> None:
+    """Arguments that can be judged before any work."""
+    if method != "S":
+        raise ValueError(
+            f"method: {method!r} has no pencil: only the rows of method \"S\" know their source; leave it out"
+        )
+    if isinstance(count, (bool, np.bool_)) or not isinstance(count, (int, np.integer)) or count < 1:
+        raise ValueError(f"count: expected a whole number of values from 1, got {short(count)}")
+    if is_traced(near):
+        raise ValueError("near: it is traced by a JAX transform, but says which values are sought; give a number")
+    if isinstance(near, (bool, str)) or np.ndim(near) or np.iscomplexobj(near) or not _finite(near):
+        raise ValueError(f"near: expected a finite real number, got {short(near)}")
+
+
+def _finite(value: Any) -> bool:
+    try:
+        return bool(np.isfinite(float(value)))
+    except (TypeError, ValueError, OverflowError):
+        return False
+
+
+def _refuse_data(disc: Discretization, pencil: Pencil) -> None:
+    """Values of conditions and sources, which an eigenvalue problem has none of."""
+    source = disc.traced.coefficients(disc.cloud.points, 0, params=disc.problem.params)[1]
+    if source is not None and not is_traced(source) and np.abs(source).max(initial=0.0) > 0.0:
+        raise ValueError(
+            "pde: it has a source, a part without u, but modes are of L u = lambda mass u; leave that part out"
+        )
+    held, given = (concrete(x) for x in (pencil.held_values, pencil.conditions))
+    for values in (held, given):
+        if values is not None and np.abs(np.asarray(values)).max(initial=0.0) > _NOTHING:
+            raise ValueError(
+                f"bcs: {_culprit(disc)} a value other than zero, but the conditions of modes are homogeneous; set "
+                "the values to 0.0"
+            )
+
+
+def _culprit(disc: Discretization) -> str:
+    """The group whose condition has a value."""
+    for group in disc.groups:
+        held = [np.asarray(concrete(value())) for value in group.held.values()]
+        parts = [np.asarray(concrete(part.numbers(None)[1])) for part in group.parts if part.linear]
+        if any(np.abs(x).max(initial=0.0) > _NOTHING for x in (*held, *parts)):
+            return f"the condition of {group.name!r} has"
+    return "a condition has"

@@ -1,0 +1,78 @@
+"""Errors of eigenvalues, by the pencil of order p + 2: what it makes of the values by way of both vectors."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from jsmitsm.discretization.pencil.assemble import Pencil, assemble_pencil
+from jsmitsm.modes.question import Question, reduced
+from jsmitsm.modes.spectrum import Pairs
+from jsmitsm.runtime.errors import SolveError
+from jsmitsm.taylor.multi_indices import HIGHEST
+
+# Rows of two orders differ in the weight of their source by less than this.
+_OUTLIER = 4.0
+
+
+def errors(question: Question, found: Pairs) -> np.ndarray:
+    """Estimated errors (k,) of the values; infinite where there is no other order to compare with.
+
+    With A', C' of order p + 2, rows D scaled to those of A, and y^T C v = 1, to first order
+
+        lambda' - lambda = y^T D (A' - lambda C') v;
+
+    for a cluster the largest singular value of that matrix.
+    """
+    other = _other_order(question)
+    if other is None:
+        return np.full(len(found.values), np.inf)
+    from scipy.sparse import csr_matrix
+
+    pattern, a, c = reduced(other, np.asarray(question.weights))
+    shape = (pattern.n, pattern.n)
+    more_a = csr_matrix((np.asarray(a), (pattern.rows_a, pattern.cols_a)), shape)
+    more_c = csr_matrix((np.asarray(c), (pattern.rows_c, pattern.cols_c)), shape)
+    rest = more_a @ found.right - (more_c @ found.right) * found.values
+    moved = found.left.T @ (_scale(question.pencil, other)[:, None] * rest)
+    out = np.zeros(len(found.values))
+    for cluster in np.unique(found.cluster):
+        at = np.flatnonzero(found.cluster == cluster)
+        out[at] = np.linalg.norm(moved[np.ix_(at, at)], 2)
+    return out
+
+
+def _other_order(question: Question) -> Pencil | None:
+    """The pencil of two orders more, or less where the cloud or the method has no more."""
+    cloud = question.pencil.layout.disc.cloud
+    if question.other is not None:
+        return question.other
+    for order in (question.order + 2, question.order - 2):
+        if order + question.depth > HIGHEST:
+            continue
+        try:
+            question.other = assemble_pencil(
+                question.problem, cloud, order=order, mass=tuple(question.massed), depth=question.depth
+            )
+            return question.other
+        except (ValueError, SolveError):  # too few particles for the one, too low an order for the other
+            continue
+    return None
+
+
+def _scale(mine: Pencil, other: Pencil) -> np.ndarray:
+    """The ratios (n,) of the weights that a particle's own source has in the rows of both, over the free unknowns."""
+    weights = []
+    for pencil in (mine, other):
+        b = pencil.B
+        fields = pencil.layout.disc.rec.fields
+        own = b.rows % fields == b.cols % fields
+        weights.append(np.bincount(b.rows[own], np.asarray(b.values)[own], b.shape[0])[mine.free])
+    here, there = weights
+    known = (here != 0) & (there != 0)
+    ratio = np.where(known, here / np.where(known, there, 1.0), 0.0)
+    sound = ratio > 0
+    typical = float(np.median(ratio[sound])) if sound.any() else 1.0
+    out: Any = np.where(sound, np.clip(ratio, typical / _OUTLIER, typical * _OUTLIER), typical)
+    return out
