@@ -134,7 +134,7 @@ class Rounds:
         return solve(self.problem, cloud, order=order, throw=True, **{"depth": depth, **options})
 
     def _operator_order(self, sol: Solution) -> int:
-        return max(sol.operator_orders)
+        return max(sol.operator_orders, default=2)  # several regions do not tell
 
     # ------------------------------------------------------------------ orders
 

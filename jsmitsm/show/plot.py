@@ -393,5 +393,6 @@ def adaptation(found: Any, *, ax: Any = None) -> np.ndarray:
     for n, e, p in zip(history["particles"], error_, history["order"]):
         axes[2].annotate(str(p), (n, e), xytext=(4, 4), textcoords="offset points", fontsize="small")
     axes[2].set_title("tolerance dashed, orders written", fontsize="medium")
+    drawing.decades(axes[2].xaxis)
     drawing.labels(axes[2], "particles", "estimated relative error")
     return axes
