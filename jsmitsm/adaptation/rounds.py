@@ -188,7 +188,7 @@ class Rounds:
             return False
         self._checked(sol, cloud, spacing)
         self.flags = sol.flags
-        apart = None if self.quantity is not None or self.norm != "max" else gaps(sol)
+        apart = gaps(sol) if self.quantity is None and self.norm == "max" and sol.defects else None
         self.apart = None
         if apart is not None and apart.max() > _GAP * self.tol * found.scale:
             self.apart = apart
