@@ -18,6 +18,8 @@ MAY_IMPORT = {
     "linear": ("runtime",),
     "discretization": ("runtime", "taylor", "particle", "cloud", "equation"),
     "solution": ("runtime", "taylor", "particle", "cloud", "equation", "linear", "discretization"),
+    "adaptation": ("runtime", "taylor", "particle", "cloud", "equation", "linear", "discretization", "solution"),
+    "evolution": ("runtime", "taylor", "particle", "cloud", "equation", "linear", "discretization", "solution"),
     "modes": ("runtime", "taylor", "particle", "cloud", "equation", "linear", "discretization", "solution"),
     "tuning": ("runtime", "taylor", "particle", "cloud", "equation", "linear", "discretization", "solution"),
     "show": ("runtime", "taylor", "particle", "cloud", "equation", "linear", "discretization", "solution"),

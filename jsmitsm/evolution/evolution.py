@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm.cloud.cloud import Cloud
-from jsmitsm.evolution import dense_output
-from jsmitsm.evolution.local_fits import StateFit
+from jsmitsm.evolution.space.local_fits import StateFit
+from jsmitsm.evolution.steps import dense_output
 from jsmitsm.runtime.arrays import Array
 from jsmitsm.runtime.tracers import frozen, is_traced
 from jsmitsm.solution.fit import Recipe
@@ -151,7 +151,7 @@ class Evolution:
         0.611
         """
         if is_traced(self._u) or jnp.ndim(self._u) != 3:
-            raise ValueError("at: inside of a JAX transform, or of a stack made by jax.vmap, only .t and .u can be read")
+            raise ValueError("at: inside of a JAX transform, or of what jax.vmap made, only .t and .u can be read")
         try:
             time = float(t)
         except (TypeError, ValueError):

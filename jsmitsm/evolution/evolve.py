@@ -10,9 +10,10 @@ from jsmitsm.cloud.neighbours import Stencils
 from jsmitsm.equation.problem import Problem
 from jsmitsm.evolution.arguments import Scheme, check, saved_times, starting_values
 from jsmitsm.evolution.evolution import Evolution
+from jsmitsm.evolution.gradient.differentiable import differentiable
 from jsmitsm.evolution.march import march
 from jsmitsm.evolution.run import Run
-from jsmitsm.evolution.timed import timed
+from jsmitsm.evolution.space.timed import timed
 from jsmitsm.runtime.arrays import ValueOrFunction
 from jsmitsm.runtime.progress import bar
 from jsmitsm.runtime.tracers import is_traced
@@ -120,8 +121,10 @@ def evolve(
     made = timed(problem, cloud)
     second = bool(made.masses[1].slots)
     start = starting_values(u0, cloud, problem.fields, second)
-    options = {"order": int(order), "scheme": scheme, "damping": damping, "stencils": stencils, "throw": throw,
-               "depth": 0 if depth == "auto" else depth}  # fmt: skip
+    options: dict[str, Any] = {
+        "order": int(order), "scheme": scheme, "damping": damping, "stencils": stencils, "throw": throw,
+        "depth": 0 if depth == "auto" else depth,
+    }  # fmt: skip
     run = Run(made, cloud, start, t, began, **options)
     if is_traced(t):
         if not (save is None or isinstance(save, int)):

@@ -154,7 +154,7 @@ def _in_order(matrix: Any, *parts: np.ndarray) -> Any:
 
 def _row_lengths(matrix: Any, xp: Any) -> Any:
     """The lengths of the deep parts of rows of unit length; where they are only rounding, none of it counts."""
-    return xp.maximum(xp.sqrt(xp.sum(matrix**2, axis=1)), FAINT)
+    return xp.sqrt(xp.maximum(xp.sum(matrix**2, axis=1), FAINT**2))
 
 
 def _ridge(scheme: Scheme) -> float:

@@ -21,6 +21,7 @@ from jsmitsm.cloud.triangulation import simplices
 from jsmitsm.runtime.errors import refuse_masked
 from jsmitsm.show.mesh_cloud import cloud_of
 from jsmitsm.show.mesh_files import needed, read_mesh
+from jsmitsm.show.mesh_regions import regions_of
 from jsmitsm.solution.solution import Solution
 
 __all__ = ["from_csv", "from_mesh", "from_shapely", "to_csv", "to_mesh", "to_pandas", "to_xarray"]
@@ -29,7 +30,7 @@ _AXES = "xyz"
 _CELLS = {1: "line", 2: "triangle", 3: "tetra"}
 
 
-def from_mesh(mesh: Any, tags: str | None = None) -> Cloud:
+def from_mesh(mesh: Any, tags: str | None = None, *, regions: bool | list[str] = False) -> Cloud:
     """The nodes of a mesh as particles, boundary groups from its physical tags, normals from its boundary facets.
 
     Parameters
@@ -43,6 +44,9 @@ def from_mesh(mesh: Any, tags: str | None = None) -> Cloud:
         The name of the cell data that hold the groups; found by itself for Gmsh (``gmsh:physical``, names from its
         physical groups), Medit and others, whose groups are cell sets or point sets. Or a list of the names of
         groups: those alone, the first first.
+    regions : bool or sequence of str
+        True, or the names of the cells' tags in their order: a cloud of several regions, see ``js.regions``. Nodes
+        between two of them are copied, and their normals are those of the facets there.
 
     Returns
     -------
@@ -78,6 +82,8 @@ def from_mesh(mesh: Any, tags: str | None = None) -> Cloud:
         mesh = read_mesh(mesh)
     if not all(hasattr(mesh, name) for name in Mesh._fields):
         raise ValueError(f"mesh: expected a meshio.Mesh or the path of a mesh file, got {type(mesh).__name__}")
+    if regions is not False:
+        return regions_of(mesh, _tag_key(tags)[0], None if regions is True else list(regions))
     return cloud_of(mesh, *_tag_key(tags))
 
 

@@ -22,7 +22,7 @@ from jsmitsm.show import drawing
 from jsmitsm.show.drawing import COLOURS, GREY, MARKERS
 from jsmitsm.solution.solution import Solution
 
-__all__ = ["cloud", "convergence", "error", "estimate", "solution", "sparsity", "tuning", "values"]
+__all__ = ["adaptation", "cloud", "convergence", "error", "estimate", "solution", "sparsity", "tuning", "values"]
 
 
 def cloud(what: Cloud | Solution, *, normals: bool = False, support: int | None = None, kernel: Kernel | None = None,
@@ -452,3 +452,54 @@ def convergence(spacing: Any, errors: Any, *, floor: float = 1e-13, xlabel: str 
         ax.legend(frameon=False, fontsize="small")
     drawing.labels(ax, xlabel, ylabel)
     return ax
+
+
+def adaptation(found: Any, *, ax: Any = None) -> np.ndarray:
+    """What :func:`jsmitsm.adapt` did, in three panels: spacings, the estimated error, and the rounds.
+
+    Spacings are distances to the nearest particle, as colours of the particles in 2D, else against x or, in 3D, against
+    the distance from the finest place; a round is a dot with its order.
+
+    ``found``: a :class:`jsmitsm.Adapted`. ``ax``: three axes. Returns them. Raises ValueError for anything else.
+
+    Examples
+    --------
+    >>> import jax; jax.config.update("jax_enable_x64", True)
+    >>> import jsmitsm as js
+    >>> ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(1.0)}
+    >>> problem = js.Problem(lambda u, x: js.laplacian(u)(x) - 2.0, ends)
+    >>> axes = js.plot.adaptation(js.adapt(problem, lambda spacing: js.interval(0.0, 1.0, spacing=spacing), 1e-4))
+    """
+    if not all(hasattr(found, name) for name in ("solution", "cloud", "history", "tol")):
+        raise ValueError(f"found: expected what js.adapt returned, got {type(found).__name__}")
+    from scipy.spatial import cKDTree
+
+    shown: Cloud = found.cloud
+    axes = drawing.panels(ax, 3, (4.6, 3.8))
+    points = np.asarray(shown.points)
+    gap = cKDTree(points).query(points, k=2)[0][:, 1]
+    error_ = np.abs(np.asarray(found.solution.error_estimate())).reshape(len(points), -1).max(axis=1)
+    error_ = np.maximum(error_, drawing.floor(error_))
+    if shown.dim == 2:
+        scale = {"norm": "log", "s": np.clip(12000.0 / len(points), 1, 25), "linewidths": 0}
+        for one, numbers, cmap, name in ((axes[0], gap, "viridis", "spacing"), (axes[1], error_, "cividis", "error")):
+            dots = one.scatter(*points.T, c=numbers, cmap=cmap, **scale)
+            one.figure.colorbar(dots, ax=one, label="estimated error" if name == "error" else name)
+            drawing.dress(one, 2)
+    else:
+        place = points[:, 0] if shown.dim == 1 else np.linalg.norm(points - points[np.argmin(gap)], axis=1)
+        order = np.argsort(place)
+        for one, numbers, name in ((axes[0], gap, "spacing"), (axes[1], error_, "estimated error")):
+            one.semilogy(place[order], numbers[order], ".", color=COLOURS[1], markersize=3)
+            drawing.labels(one, "x" if shown.dim == 1 else "distance from the finest place", name)
+    axes[0].set_title(f"{len(points)} particles", fontsize="medium")
+    history = found.history
+    error_ = np.where(np.isfinite(history["error"]), history["error"], np.nan)
+    axes[2].loglog(history["particles"], error_, ".-", color=COLOURS[4], markersize=9)
+    axes[2].axhline(found.tol, color="k", linewidth=0.8, linestyle="--")
+    for n, e, p in zip(history["particles"], error_, history["order"]):
+        axes[2].annotate(str(p), (n, e), xytext=(4, 4), textcoords="offset points", fontsize="small")
+    axes[2].set_title("tolerance dashed, orders written", fontsize="medium")
+    drawing.decades(axes[2].xaxis)
+    drawing.labels(axes[2], "particles", "estimated relative error")
+    return axes

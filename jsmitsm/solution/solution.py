@@ -377,6 +377,11 @@ class Solution:
             self._share = share(np.reshape(error, np.shape(self._values)), np.asarray(self._values))
         return error
 
+    @property
+    def defects(self) -> bool:
+        """Whether the estimate knows defects, and :meth:`correction` more than the size of the error."""
+        return not hasattr(self._fit, "error_estimate")
+
     def correction(self) -> Correction:
         """What the error estimate is made of, for those who refine by it.
 
@@ -401,7 +406,7 @@ class Solution:
         True
         """
         self.refuse_stacked()
-        if hasattr(self._fit, "error_estimate"):
+        if not self.defects:
             raise ValueError("correction: several regions have an error estimate, but no defects to refine by")
         found = correction(self._fit, self._values)
         self._size(found)
@@ -429,7 +434,7 @@ class Solution:
         if self._found is None and self._report is not None:
             self._found = self._report.flags(self._estimated)
         large = f"The estimated error is {self._share:.0%} of the solution: refine the cloud, or change the order."
-        return [*(self._found or []), *([] if self._share <= LARGE else [large])]
+        return [*(self._found or []), *self.stats.get("objections", []), *([] if self._share <= LARGE else [large])]
 
     def condition_numbers(self) -> tuple[np.ndarray, float]:
         """Condition numbers of every particle's moment matrix and of the global system.

@@ -105,23 +105,23 @@ def solve(
     True
     """
     check_tolerance(order, tol)
-    if of_regions(problem, cloud):
-        return solve_regions(
-            problem, cloud, method=method, order=order, kernel=kernel, stencils=stencils, basis_terms=basis_terms,
-            formulation=formulation, solver=solver, u0=u0, throw=throw, depth=depth,
-        )  # fmt: skip
 
-    def solved(order: Any) -> tuple[Solution, Run]:
+    def solved(order: Any) -> Solution:
+        if of_regions(problem, cloud):
+            return solve_regions(
+                problem, cloud, method=method, order=order, kernel=kernel, stencils=stencils, basis_terms=basis_terms,
+                formulation=formulation, solver=solver, u0=u0, throw=throw, depth=depth,
+            )  # fmt: skip
         run = prepared(
             problem, cloud, method=method, order=order, kernel=kernel, stencils=stencils, basis_terms=basis_terms,
             formulation=formulation, solver=solver, u0=u0, throw=throw, depth=depth,
         )  # fmt: skip
         if run.disc.linear:
             values, good = run.step(numbers(run.disc, problem))
-            return finished(run, values, None, good, 1), run
-        return finished(run, *newton(run, u0)), run
+            return finished(run, values, None, good, 1)
+        return finished(run, *newton(run, u0))
 
-    return of_tolerance(solved, tol) if order == "auto" and tol is not None else solved(order)[0]
+    return of_tolerance(solved, tol) if order == "auto" and tol is not None else solved(order)
 
 
 def prepared(

@@ -295,6 +295,11 @@ def _check_gaps(sketch: _Sketch) -> None:
             gap = np.linalg.norm(points[near][:, None] - joint[None], axis=2).min(axis=1)
             near = near[gap > 2.0 * h[near]]
         if len(near):
+            # A thin region between them is no gap.
+            height, way = shape.distance(points[near])
+            middle = points[near] - 0.5 * height[:, None] * way
+            near = near[np.min([other.distance(middle)[0] for other in sketch.shapes.values()], axis=0) > 0]
+        if len(near):
             other = next(n for n, ids in sketch.on.items() if near[0] in ids)
             raise ValueError(
                 f"shapes: a gap between {other!r} and {name!r} at {points[near[0]]}, thinner than the spacing; let "
