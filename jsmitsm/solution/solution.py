@@ -379,7 +379,7 @@ class Solution:
 
     @property
     def defects(self) -> bool:
-        """Whether the estimate knows defects, and :meth:`correction` more than the size of the error."""
+        """Whether the estimate knows defects, and ``correction`` more than the size of the error."""
         return not hasattr(self._fit, "error_estimate")
 
     def correction(self) -> Correction:
