@@ -455,12 +455,12 @@ def convergence(spacing: Any, errors: Any, *, floor: float = 1e-13, xlabel: str 
 
 
 def adaptation(found: Any, *, ax: Any = None) -> np.ndarray:
-    """What :func:`jsmitsm.adapt` did, in three panels: spacings, the estimated error, and the rounds.
+    """What ``js.adapt`` did, in three panels: spacings, the estimated error, and the rounds.
 
     Spacings are distances to the nearest particle, as colours of the particles in 2D, else against x or, in 3D, against
     the distance from the finest place; a round is a dot with its order.
 
-    ``found``: a :class:`jsmitsm.Adapted`. ``ax``: three axes. Returns them. Raises ValueError for anything else.
+    ``found``: a ``js.Adapted``. ``ax``: three axes. Returns them. Raises ValueError for anything else.
 
     Examples
     --------

@@ -62,11 +62,11 @@ class Solution:
     >>> # The answer is x^3.
     >>> sol = js.solve(js.Problem(lambda u, x: js.laplacian(u)(x) - 6 * x[0], ends), js.interval(0.0, 1.0, 9))
     >>> sol
-    Solution(u: 9, method='S', order=4, converged=True)
+    Solution(u: 9, method='S', order=4, depth=4, converged=True)
     >>> [round(float(value[0]), 9) for value in (sol([[0.3]]), sol.grad([[0.3]])[0], sol.derivative([[0.3]], (2,)))]
     [0.027, 0.27, 1.8]
     >>> round(float(sol.flux("right")), 9), sol.coefficients.shape, bool(sol.error_estimate().max() < 1e-12), sol.flags
-    (3.0, (9, 5), True, [])
+    (3.0, (9, 9), True, [])
     """
 
     def __init__(self, values, cloud, recipe, fit, converged, iterations, stats, fitted=None, report=None):
@@ -379,7 +379,7 @@ class Solution:
 
     @property
     def defects(self) -> bool:
-        """Whether the estimate knows defects, and :meth:`correction` more than the size of the error."""
+        """Whether the estimate knows defects, and ``correction`` more than the size of the error."""
         return not hasattr(self._fit, "error_estimate")
 
     def correction(self) -> Correction:
