@@ -127,7 +127,7 @@ class Traced:
         return replace(self, _record=self._record._replace(consts=tuple(map(any_number, self._record.consts))))
 
     def jumps(self, points: Any, near: Any, *, params: Any = None, slots: Any = None) -> str | None:
-        """What jumps under a derivative, in words, see :mod:`jsmitsm.jumps`; None: nothing does."""
+        """What jumps under a derivative, in words, see ``jsmitsm.jumps``; None: nothing does."""
         if self.branches is None:
             return None
         consts = self._record.consts[len(self._record.consts) - len(self._record.written.constvars) :]

@@ -192,7 +192,7 @@ def unconstrained(scheme: Scheme) -> tuple[Scheme, Elimination]:
 
 
 def eliminate_on_host(scheme: Scheme, jac: np.ndarray, length: float = 1.0) -> Elimination:
-    """:func:`eliminate` in numpy, where one elimination serves many particles; kept for later."""
+    """``eliminate`` in numpy, where one elimination serves many particles; kept for later."""
     bare = Scheme(scheme.method, scheme.rec, scheme.free, scheme.dependent, flat=scheme.flat)
     return _eliminated_once(bare, jac.tobytes(), jac.shape, jac.dtype.str, length)
 

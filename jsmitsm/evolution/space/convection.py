@@ -1,0 +1,61 @@
+"""Convection against diffusion between two particles: what the pencil stands, and what is refused."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from jsmitsm.evolution.space.semidiscrete import Semidiscrete
+
+# Cell Peclet numbers |v| h / eps: up to the first the recursion is stable, beyond the second nothing is.
+MODERATE, MOST = 2.0, 5.0
+
+
+def refuse_convection(semi: Semidiscrete, flags: list[str]) -> None:
+    """ValueError where convection outweighs diffusion between neighbours; a flag where it comes near."""
+    operator, problem = semi.timed.operator, semi.timed.problem
+    whole = semi.timed.space
+    for e, row in enumerate(whole.pattern):
+        rates = any(p for m in semi.timed.masses for p in (m.pattern[e] if m.slots else ()))
+        first = [s for s, (_, b) in enumerate(whole.slots) if row[s] and sum(b) == 1]
+        if rates and first and whole.order[e] == 1 and not _coupled(whole, e):
+            raise ValueError(
+                f"pde: equation {e} transports without any diffusion, and this method is unstable for pure advection; "
+                "add a diffusion of about |v| spacing / 2, or use another method"
+            )
+    if semi.second or not len(operator.slots) or max(operator.order) != 2:
+        return
+    points = np.asarray(semi.points)
+    spacing = float((np.prod(np.ptp(points, axis=0)) / len(points)) ** (1.0 / points.shape[1]))
+    jac, _ = operator.coefficients(points, 0, params=problem.params)
+    worst = 0.0
+    for e in range(semi.fields):
+        if operator.order[e] != 2:
+            continue
+        speed, diffusion = (
+            np.sqrt(sum(
+                np.broadcast_to(jac[e, s, 0], len(points)) ** 2
+                for s, (_, b) in enumerate(operator.slots) if operator.pattern[e, s] and sum(b) == m
+            ) + np.zeros(len(points)))
+            for m in (1, 2)
+        )  # fmt: skip
+        diffusion = diffusion / np.sqrt(points.shape[1])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            worst = max(worst, float(np.nanmax(np.where(speed > 0, speed * spacing / diffusion, 0.0))))
+    if worst > MOST:
+        raise ValueError(
+            f"pde: between neighbouring particles convection is {worst:.3g} times the diffusion (|v| h / eps, the cell "
+            f"Peclet number), and beyond {MOST:g} the evolution is unstable: refine the cloud to a spacing of "
+            f"{spacing * MODERATE / worst:.2g}, or add diffusion"
+        )
+    if worst > MODERATE:
+        flags.append(
+            f"Between neighbouring particles convection is {worst:.3g} times the diffusion; up to {MODERATE:g} is "
+            "known to be stable: a finer cloud is safer."
+        )
+
+
+def _coupled(whole: Any, e: int) -> bool:
+    """Whether an equation of first order drives its field by another's, as first-order forms of waves do."""
+    return any(k != e and sum(b) == 1 and p for (k, b), p in zip(whole.slots, whole.pattern[e]))

@@ -1,0 +1,188 @@
+"""A problem in time as the package knows problems: t is one more parameter, rates are slots of the record.
+
+The residual R(u, x, t) is recorded once and seen in parts:
+
+    M2 u_tt + M1 u_t + L u + N(u, x, t) = 0
+
+L holds the slots whose coefficients depend neither on u nor on t, N all the rest, the source too.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from jsmitsm.cloud.cloud import Cloud
+from jsmitsm.equation.closing import closed
+from jsmitsm.equation.field import RATE
+from jsmitsm.equation.problem import Condition, Problem
+from jsmitsm.equation.traced import Traced
+from jsmitsm.equation.tracing import moving, restricted, trace
+from jsmitsm.runtime.errors import IN_FUNCTIONS, in_words
+from jsmitsm.runtime.tracers import is_traced
+from jsmitsm.taylor.multi_indices import Slot
+
+# The time is the first leaf of the parameters.
+TIME = 0
+
+
+@dataclass
+class Timed:
+    """The parts of a problem in time; every record takes the parameters (t, params).
+
+    problem : closed, its pde the record of L. rest: N. masses: coefficients of the first and the second rate.
+    steady : whether neither N at u = 0 nor a condition depends on t.
+    quasilinear : whether N holds derivatives of the order of an equation. space: the whole residual without rates.
+    """
+
+    problem: Problem
+    space: Traced
+    rest: Traced
+    masses: tuple[Traced, ...]
+    steady: bool
+    quasilinear: bool
+
+    @property
+    def operator(self) -> Traced:
+        """The record of L."""
+        assert isinstance(self.problem.pde, Traced)
+        return self.problem.pde
+
+    @property
+    def linear(self) -> bool:
+        return not self.rest.slots
+
+    def at(self, t: Any, params: Any = None) -> Problem:
+        """The closed problem at a moment; params: others than its own."""
+        new = object.__new__(Problem)
+        new.__dict__.update(self.problem.__dict__)
+        new.params = (t, self.problem.params[1] if params is None else params)
+        return new
+
+    def mass(self, order: int, points: Any, params: Any) -> Any:
+        """Coefficients (N, E, F) of the rates of this order."""
+        record = self.masses[order - 1]
+        n, fields = len(points), self.problem.fields
+        columns: list[Any] = [np.zeros((n, fields))] * fields
+        if record.slots:
+            jac, _ = record.coefficients(points, 0, params=params)
+            xp = jnp if is_traced(jac) else np
+            for s, (k, _) in enumerate(record.slots):
+                columns[k % RATE] = xp.broadcast_to(jac[:, s, 0], (fields, n)).T
+        return (jnp if is_traced(columns) else np).stack(columns, axis=2)
+
+
+def timed(problem: Problem, cloud: Cloud) -> Timed:
+    """Record a problem in time; ValueError where it is none."""
+    with_params = problem.params is not None
+    pde = _in_time(problem.pde, with_params, (("u, x, t", 3),), "pde", "js.Problem")
+    bcs = {
+        name: [_condition_in_time(c, with_params, f"bcs[{name!r}]") for c in conditions]
+        for name, conditions in problem.bcs.items()
+    }
+    stated = Problem(pde, bcs, problem.fields, (np.asarray(0.0), problem.params))
+    try:
+        whole = trace(pde, cloud.dim, problem.fields, params=stated.params)
+    except IN_FUNCTIONS as error:
+        text = in_words(error)
+        raise ValueError(text if text.startswith("pde") else f"pde: {text}; it returns a number or a scalar per "
+                         "equation") from error  # fmt: skip
+    if whole.n_equations != problem.fields:
+        raise ValueError(
+            f"pde: returns {whole.n_equations} residual(s) for fields={problem.fields}; a system of F fields needs F"
+        )
+    changing, source_moves = moving(whole, TIME)
+    rates = [[s for s in whole.slots if s[0] // RATE == j] for j in (1, 2)]
+    _check_rates(rates, changing)
+    space = [s for s in whole.slots if s[0] < RATE]
+    linear = [s for s in space if s not in changing]
+    operator = restricted(whole, linear, affine=True)
+    rest = restricted(whole, [s for s in space if s in changing])
+    orders = [max((sum(b) for (_, b), p in zip(whole.slots, row) if p), default=-1) for row in whole.pattern]
+    problem_in_time = closed(stated, whole)
+    problem_in_time.pde = operator  # type: ignore[assignment]
+    condition_moves = _check_conditions(problem_in_time)
+    return Timed(
+        problem_in_time, restricted(whole, space), rest, tuple(restricted(whole, r, affine=True) for r in rates),
+        not source_moves and not condition_moves,
+        any(m > max(o, 0) for m, o in zip(orders, operator.order)),
+    )  # fmt: skip
+
+
+def _check_rates(rates: list[list[Slot]], changing: set[Slot]) -> None:
+    if not rates[0] and not rates[1]:
+        raise ValueError("pde: no rate in it; write js.dt(u)(x) where u changes in time, or use js.solve")
+    for slot in [*rates[0], *rates[1]]:
+        if slot in changing:
+            raise ValueError(
+                f"pde: the coefficient of the rate of field {slot[0] % RATE} depends on u or on t; divide the equation "
+                "by it, so that js.dt(u)(x) stands alone or with a factor that depends on x"
+            )
+
+
+def _check_conditions(problem: Problem) -> bool:
+    """Whether a condition's value depends on t; ValueError where its form does, or where it is nonlinear."""
+    found = False
+    for name, conditions in problem.bcs.items():
+        for c in conditions:
+            for part, value in c.parts.items():
+                if not isinstance(value, Traced):
+                    continue
+                slots, rest = moving(value, TIME)
+                if slots:
+                    raise ValueError(
+                        f"bcs[{name!r}]: the condition is nonlinear in u, or a coefficient of u in it depends on t; "
+                        "js.evolve takes conditions that are linear, with values that may depend on t: write the "
+                        "nonlinear part as the flux of a field of its own, or linearise it"
+                    )
+                if rest and part in ("a", "b"):
+                    raise ValueError(f"bcs[{name!r}].{part}: it depends on t; only the value of a condition may")
+                found = found or rest
+    return found
+
+
+def _condition_in_time(c: Condition, with_params: bool, where: str) -> Condition:
+    forms = (("u, x, n, t", 4), ("u, x, t", 3)) if c.kind == "condition" else (("x, t", 2), ("x", 1))
+
+    def one(name: str, part: Any) -> Any:
+        return _in_time(part, with_params, forms, f"{where}.{name}", c.kind) if callable(part) else part
+
+    return Condition(c.kind, c.field, **{name: one(name, part) for name, part in c.parts.items()})
+
+
+def _in_time(function: Callable[..., Any], with_params: bool, forms: Any, where: str, kind: str) -> Callable[..., Any]:
+    """A user's function of t as one of the parameters (t, params)."""
+    fitting = [names for names, count in forms if _takes(function, count + with_params)]
+    tail = ", params" if with_params else ""
+    if not fitting:
+        raise ValueError(
+            f"{where}: js.evolve calls it as f({forms[0][0]}{tail}), with the time t"
+            + (", and params last" if with_params else "") + "; it takes other arguments"
+        )  # fmt: skip
+    names = fitting[0]
+
+    def last(p: Any) -> tuple[Any, ...]:
+        return ((p[0],) if names.endswith("t") else ()) + ((p[1],) if with_params else ())
+
+    if names == "u, x, t" and kind == "condition":
+        return lambda u, x, n, p: function(u, x, *last(p))
+    if names == "u, x, n, t":
+        return lambda u, x, n, p: function(u, x, n, *last(p))
+    if names == "u, x, t":
+        return lambda u, x, p: function(u, x, *last(p))
+    return lambda x, p: function(x, *last(p))
+
+
+def _takes(function: Callable[..., Any], count: int) -> bool:
+    try:
+        inspect.signature(function).bind(*[None] * count)
+    except TypeError:
+        return False
+    except ValueError:  # a callable without a signature
+        return True
+    return True

@@ -1,0 +1,67 @@
+"""Implicit stages of nonlinear problems by Newton's method, its matrix kept as long as it serves."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from jsmitsm.evolution.space.matrices import Sparse, combined
+from jsmitsm.evolution.space.semidiscrete import Semidiscrete
+from jsmitsm.evolution.steps.stepping import Stopped
+from jsmitsm.linear.sparse import Factor
+from jsmitsm.runtime.errors import SolveError
+
+# Corrections at the most; a correction must shrink to this part of the last, or the matrix is made anew.
+MOST, SLOW = 12, 0.1
+# Relative change of the state at which a stage counts as solved.
+SOLVED = 1e-11
+
+
+class Newton:
+    """Solves E y + g (A y + B N(y)) = r for a stage."""
+
+    def __init__(self, semi: Semidiscrete):
+        self.semi = semi
+        self._factor: Any = None
+        self._g = 0.0
+        self.counts = {"iterations": 0, "factorisations": 0}
+
+    def __call__(self, r: np.ndarray, guess: np.ndarray, t: float, g: float, known: np.ndarray) -> np.ndarray:
+        semi, y = self.semi, guess
+        before, fresh = np.inf, False
+        for _ in range(MOST):
+            with np.errstate(all="ignore"):
+                misfit = semi.system.mass(y) + g * (semi.system.stiff(y) - semi.explicit(y, t, known)) - r
+            if not np.isfinite(misfit).all():
+                break
+            if self._factor is None or g != self._g:
+                self._prepare(y, t, g, known)
+                fresh = True
+            change = self._factor.solve(misfit)
+            y = y - change
+            self.counts["iterations"] += 1
+            size = float(np.abs(change).max(initial=0.0)) / max(float(np.abs(y).max(initial=0.0)), 1e-300)
+            if size <= SOLVED or (size <= 1e-8 and size >= 0.5 * before):  # round-off is reached
+                return y
+            if size > SLOW * before and not fresh:
+                self._factor = None
+            before, fresh = size, False
+        self._factor = None
+        raise Stopped(
+            f"a stage's equations at t = {t:.6g} were not solved by {MOST} steps of Newton's method: take more steps, "
+            "or a tol instead of steps"
+        )
+
+    def _prepare(self, y: np.ndarray, t: float, g: float, known: np.ndarray) -> None:
+        semi = self.semi
+        system = semi.system
+        extra = (g * semi.linearised(semi.steepness(semi.placed(y, known), t))).tocoo()
+        more = Sparse(extra.data, extra.coords[0], extra.coords[1], extra.shape)
+        values, rows, cols = combined([(1.0, system.masses[0]), (g, system.stiffness), (1.0, more)])
+        try:
+            self._factor = Factor(values, rows, cols, system.n, system.points, "sparse", False, 0)
+        except SolveError as fault:
+            raise Stopped(f"the stage's system at t = {t:.6g} cannot be solved: {fault}") from fault
+        self._g = g
+        self.counts["factorisations"] += 1
