@@ -77,7 +77,7 @@ class Job:
         kernel = js.SuperGaussian(h=self.h * cloud.spacing, d=self.d)
         return lambda: js.solve(
             problem, cloud, method=self.method, order=self.order, basis_terms=self.basis_terms, kernel=kernel,
-            stencils=near,
+            stencils=near, depth=0,
         )  # fmt: skip
 
 

@@ -65,7 +65,22 @@ def errors(plt):
     return fig
 
 
-def main(names=("first", "slices", "errors")):
+def regions(plt):
+    """A disk in a plate, whose contact is imperfect: particles, and a temperature that jumps."""
+    disk = js.sdf.circle((0.0, 0.0), 0.5)
+    around = js.sdf.difference(js.sdf.rectangle((-1, -1), (1, 1)), disk)
+    cloud = js.regions({"disk": disk, "plate": around}, ((-1, -1), (1, 1)), 0.08)
+    k = {"disk": 10.0, "plate": 1.0}
+    contact = js.interface({name: lambda u, x, n, c=c: c * n @ js.grad(u)(x) for name, c in k.items()}, resistance=0.5)
+    bcs = {"boundary": js.dirichlet(lambda x: x[0]), "disk|plate": contact}
+    sol = js.solve(js.Problem({name: lambda u, x: js.laplacian(u)(x) for name in k}, bcs), cloud)
+    fig, (left, right) = plt.subplots(1, 2, figsize=(10, 3.8), layout="constrained")
+    js.plot.cloud(cloud, ax=left)
+    js.plot.solution(sol, ax=right)
+    return fig
+
+
+def main(names=("first", "slices", "errors", "regions")):
     import matplotlib.pyplot as plt
 
     IMAGES.mkdir(parents=True, exist_ok=True)
@@ -77,4 +92,4 @@ def main(names=("first", "slices", "errors")):
 
 
 if __name__ == "__main__":
-    main(arguments(__doc__, names="picture").names or ("first", "slices", "errors"))
+    main(arguments(__doc__, names="picture").names or ("first", "slices", "errors", "regions"))

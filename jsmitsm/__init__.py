@@ -3,11 +3,13 @@
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from jsmitsm.cloud.cloud import Cloud, box, interval, rectangle
+from jsmitsm.cloud.cloud import Cloud, box, rectangle
+from jsmitsm.cloud.line.interval import interval
 from jsmitsm.cloud.neighbours import Stencils, stencils
 from jsmitsm.equation.marks import meant
 from jsmitsm.equation.operators import divergence, dt, grad, hessian, laplacian, partial
 from jsmitsm.equation.problem import Condition, Problem, condition, dirichlet, fix, free, neumann, periodic, robin
+from jsmitsm.equation.regions.interface import interface
 from jsmitsm.particle.kernels import Constant, CubicSpline, Gaussian, Kernel, SuperGaussian, Wendland
 from jsmitsm.runtime.errors import SolveError, did_you_mean
 from jsmitsm.runtime.progress import no_progress
@@ -16,20 +18,23 @@ from jsmitsm.taylor.multi_indices import multi_indices
 __version__ = "0.2.0"
 
 __all__ = [
-    "Cloud", "Condition", "Constant", "CubicSpline", "Evolution", "Factorization", "Formulation", "Gaussian", "Kernel",
-    "Method", "Modes", "Problem", "Quality", "Solution", "SolveError", "Solver", "Stencils", "SuperGaussian",
-    "TuneResult", "Wendland", "box", "condition", "continuation", "dirichlet", "divergence", "dt", "eigen", "evolve",
-    "factorize", "files", "fix", "free", "from_polygon", "from_sdf", "grad", "hessian", "interval", "laplacian",
-    "meant", "multi_indices", "neumann", "no_progress", "partial", "periodic", "plot", "quadrature", "quality",
-    "rectangle", "robin", "sdf", "show_versions", "solve", "stencils", "tune",
+    "Adapted", "Cloud", "Condition", "Constant", "CubicSpline", "Evolution", "Factorization", "Formulation",
+    "Gaussian", "Kernel", "Method", "Modes", "Problem", "Quality", "Solution", "SolveError", "Solver", "Stencils",
+    "SuperGaussian", "TuneResult", "Wendland", "adapt", "box", "condition", "continuation", "dirichlet",
+    "divergence", "dt", "eigen", "evolve", "factorize", "files", "fix", "free", "from_polygon", "from_sdf", "grad",
+    "hessian", "interface", "interval", "laplacian", "meant", "multi_indices", "neumann", "no_progress", "partial",
+    "periodic", "plot", "quadrature", "quality", "rectangle", "regions", "robin", "sdf", "show_versions", "solve",
+    "stencils", "tune",
 ]  # fmt: skip
 
 # Imported when first used, the solver too: who draws or makes clouds need not wait for it. Where each stands is said
 # twice, to type checkers and to Python: with a module's __getattr__ in sight a checker would believe in every name.
 if TYPE_CHECKING:
+    from jsmitsm.adaptation.adapt import Adapted, adapt
     from jsmitsm.cloud import sdf
     from jsmitsm.cloud.quadrature import quadrature
     from jsmitsm.cloud.quality import Quality, quality
+    from jsmitsm.cloud.regions.making import regions
     from jsmitsm.cloud.shapes import from_polygon, from_sdf
     from jsmitsm.evolution.evolution import Evolution
     from jsmitsm.evolution.evolve import evolve
@@ -46,6 +51,7 @@ if TYPE_CHECKING:
     from jsmitsm.tuning.tune import TuneResult, tune
 else:
     _LAZY = {
+        "Adapted": "adaptation.adapt",
         "Evolution": "evolution.evolution",
         "Factorization": "solution.factorization",
         "Formulation": "solution.arguments",
@@ -55,6 +61,7 @@ else:
         "Solution": "solution.solution",
         "Solver": "linear.linsolve",
         "TuneResult": "tuning.tune",
+        "adapt": "adaptation.adapt",
         "continuation": "solution.nonlinear.continuation",
         "eigen": "modes.eigen",
         "evolve": "evolution.evolve",
@@ -66,6 +73,7 @@ else:
         "quadrature": "cloud.quadrature",
         "quality": "cloud.quality",
         "sdf": "cloud",
+        "regions": "cloud.regions.making",
         "show_versions": "runtime.versions",
         "solve": "solution.solve",
         "tune": "tuning.tune",

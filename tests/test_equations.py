@@ -58,7 +58,7 @@ def test_nearest_neighbours_alone_fail_where_the_density_jumps(name):
     cloud = case.cloud()
     plain = case.solve(6, cloud, stencils=js.stencils(cloud, size=28), throw=False)
     assert plain.stats["lebesgue_max"] > 100
-    assert not case.error(plain) < case.ceilings[6]
+    assert not case.error(plain) < 10 * case.error(case.solve(6, cloud))
 
 
 def test_a_wrong_solution_misses():

@@ -92,9 +92,9 @@ class Cloud:
         normals: ArrayLike | None = None,
         cell_groups: Mapping[str, ArrayLike] | None = None,
     ):
-        self.points: Array = _checked_points(points)
-        self.groups = _checked_groups(groups, len(self.points))
-        self.normals: Array | None = _checked_normals(normals, self.points, self.groups)
+        self.points: Array = checked_points(points)
+        self.groups = checked_groups(groups, len(self.points))
+        self.normals: Array | None = checked_normals(normals, self.points, self.groups)
         self.cell_groups = _checked_cell_groups(cell_groups, len(self.points))
         self._spacing: float | None = None
 
@@ -145,10 +145,10 @@ class Cloud:
                 f"points: shape {np.shape(points)} came, {self.points.shape} was expected; "
                 "build a new Cloud for another number of particles"
             )
-        new.points = self.points if points is None else _checked_points(points)
+        new.points = self.points if points is None else checked_points(points)
         new.groups = self.groups
         new.cell_groups = self.cell_groups
-        new.normals = self.normals if normals is None else _checked_normals(normals, new.points, self.groups)
+        new.normals = self.normals if normals is None else checked_normals(normals, new.points, self.groups)
         new._spacing = None if points is not None else self._spacing
         return new
 
@@ -171,8 +171,8 @@ class Cloud:
         return new
 
 
-def _checked_points(points: Any) -> Any:
-    """Points as a float array (N, D); a traced array passes through."""
+def checked_points(points: Any, label: np.ndarray | None = None) -> Any:
+    """Points as a float array (N, D); a traced array passes through. Points of two labels (N,) may coincide."""
     if isinstance(points, jax.core.Tracer):
         shape = points.shape
     else:
@@ -201,8 +201,9 @@ def _checked_points(points: Any) -> Any:
                 f"points: coordinates of size {size:.0e}, whose powers leave the range of floats; use another unit of "
                 "length"
             )
-        order = np.lexsort(points.T)
-        same = np.flatnonzero((np.diff(points[order], axis=0) == 0).all(axis=1))
+        keys = points.T if label is None else [*points.T, label]
+        order = np.lexsort(keys)
+        same = np.flatnonzero(np.all([np.diff(np.asarray(key)[order]) == 0 for key in keys], axis=0))
         if len(same):
             pairs = [(int(order[k]), int(order[k + 1])) for k in same[:5]]
             raise ValueError(
@@ -211,7 +212,7 @@ def _checked_points(points: Any) -> Any:
     return frozen(points)
 
 
-def _checked_groups(groups: Mapping[str, Any], n: int) -> Groups:
+def checked_groups(groups: Mapping[str, Any], n: int) -> Groups:
     """Disjoint groups that cover all n particles."""
     if not isinstance(groups, Mapping) or INTERIOR not in groups:
         raise ValueError(
@@ -276,7 +277,7 @@ def _checked_index(what: str, index: Any, n: int) -> np.ndarray:
     return index
 
 
-def _checked_normals(normals: Any, points: Any, groups: Groups) -> Any:
+def checked_normals(normals: Any, points: Any, groups: Groups) -> Any:
     """Unit normals at the boundary, NaN inside; None and traced arrays pass through."""
     if normals is None:
         return None
@@ -308,18 +309,6 @@ def _describe_groups(groups: Any) -> str:
     return f"keys {list(groups)}" if isinstance(groups, Mapping) else type(groups).__name__
 
 
-def interval(a: float, b: float, n: int) -> Cloud:
-    """``n`` equally spaced particles on [a, b], ascending; groups interior, left, right.
-
-    Raises ValueError unless b > a and n is at least 2.
-
-    >>> import jsmitsm as js
-    >>> js.interval(0.0, 1.0, 5).spacing
-    0.25
-    """
-    return _lattice((a,), (b,), (n,), 0.0, 0, names=("a", "b", "n"))
-
-
 def rectangle(
     lo: Sequence[float], hi: Sequence[float], shape: Sequence[int], jitter: float = 0.0, seed: int = 0
 ) -> Cloud:
@@ -334,7 +323,7 @@ def rectangle(
     >>> len(js.rectangle((0, 0), (4, 9), (5, 10)))
     50
     """
-    return _lattice(lo, hi, shape, jitter, seed, dim=2)
+    return lattice(lo, hi, shape, jitter, seed, dim=2)
 
 
 def box(lo: Sequence[float], hi: Sequence[float], shape: Sequence[int], jitter: float = 0.0, seed: int = 0) -> Cloud:
@@ -345,11 +334,11 @@ def box(lo: Sequence[float], hi: Sequence[float], shape: Sequence[int], jitter: 
     >>> sorted(js.box((0, 0, 0), (1, 1, 1), (3, 3, 3)).groups)
     ['back', 'bottom', 'front', 'interior', 'left', 'right', 'top']
     """
-    return _lattice(lo, hi, shape, jitter, seed, dim=3)
+    return lattice(lo, hi, shape, jitter, seed, dim=3)
 
 
-def _lattice(lo, hi, shape, jitter, seed, dim=1, names=("lo", "hi", "shape")) -> Cloud:
-    """A lattice cloud of any dimension."""
+def lattice(lo, hi, shape, jitter, seed, dim=1, names=("lo", "hi", "shape")) -> Cloud:
+    """A lattice cloud of any dimension; ``names``: of the arguments in what is raised."""
     lo, hi = (_checked_corner(v, name, dim) for v, name in zip((lo, hi), names))
     if not (hi > lo).all():
         raise ValueError(f"{names[1]}: {hi.tolist()} must be greater than {names[0]} = {lo.tolist()} along every axis")

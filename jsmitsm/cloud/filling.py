@@ -1,4 +1,4 @@
-"""Evenly spaced particles inside of a domain: scattered by an octree, relaxed, holes filled.
+"""Evenly spaced particles inside of a domain: a lattice, or scattered by an octree; relaxed, holes filled.
 
 A domain is known here only through ``distance(x (M, D)) -> (d (M,), outward (M, D))``, a signed
 distance that need be accurate only near the boundary. Everything runs on the host in numpy.
@@ -6,52 +6,32 @@ distance that need be accurate only near the boundary. Everything runs on the ho
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol
+from typing import Any
 
 import jax
 import numpy as np
 
+from jsmitsm.cloud.packing.lattice import lattice
+from jsmitsm.cloud.packing.octree import Region, Spacing, morton, refine
+from jsmitsm.cloud.packing.relaxation import CLEARANCE, clear, relax, relax_uneven, repair
 from jsmitsm.runtime.errors import short
 
-Spacing = Callable[[np.ndarray], np.ndarray]
 SpacingLike = float | Callable[[np.ndarray], Any]
 
 # Particles per spacing^D of the densest even arrangement: hexagons in 2D; in 3D a little below the
 # 1.41 of a face-centred lattice, which relaxation from a random start does not find.
 _DENSITY = {1: 1.0, 2: 2.0 / np.sqrt(3.0), 3: 1.25}
-_NEIGHBOURS = {2: 8, 3: 14}
-# Where the spacing varies, a force that scales with the mean of two spacings drives particles to the coarse side:
-# there are more of them on the fine side. This weight of the neighbour's spacing stops the drift (found by trial).
-_LEAN = {2: 0.6, 3: 0.75}
-# Base cells along the longest side: what decides how small a part of the domain is noticed at all.
-BASE = {1: 256, 2: 48, 3: 20}
-# A new particle goes where an empty ball has more than this many spacings as radius; 0.58 is a gap between hexagons.
-_HOLE = 0.85
-_PROBES = 6
-# Cells of an octree before it is taken for a mistake in the spacing.
-_MOST = 30_000_000
-# No interior particle comes closer to the boundary than this many spacings.
-CLEARANCE = 0.5
 
 
-class Region(Protocol):
-    """What the packing has to know about a domain."""
+class Constant:
+    """The same spacing everywhere."""
 
-    def distance(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Signed distance (M,), negative inside, and the unit direction of its growth (M, D)."""
-        ...
+    def __init__(self, value: float):
+        self.value = value
 
-
-class Cells(NamedTuple):
-    """Cubes of an octree: centres (M, D), widths (M,), and what the region says at the centres."""
-
-    centers: np.ndarray
-    widths: np.ndarray
-    distance: np.ndarray
-    outward: np.ndarray
-    spacing: np.ndarray
+    def __call__(self, x: np.ndarray) -> np.ndarray:
+        return np.full(len(x), self.value)
 
 
 def spacing_function(spacing: Any) -> Spacing:
@@ -62,7 +42,7 @@ def spacing_function(spacing: Any) -> Spacing:
             raise ValueError(
                 f"spacing: expected a positive finite number or a function (M, D) -> (M,), got {short(spacing)}"
             )
-        return lambda x: np.full(len(x), float(value))
+        return Constant(float(value))
 
     def checked(x: np.ndarray) -> np.ndarray:
         given = spacing(x)
@@ -86,70 +66,6 @@ def spacing_function(spacing: Any) -> Spacing:
     return checked
 
 
-def refine(
-    region: Region, spacing: Spacing, lo: np.ndarray, hi: np.ndarray, fraction: float, inside: bool, base: float = 0.0
-) -> tuple[Cells, Cells]:
-    """Split cubes until none is wider than ``fraction`` of the spacing.
-
-    Returns the finished cells near the boundary (with ``inside`` also those in the domain) and the
-    coarse ones left behind. ``base`` is the width to start from, chosen here where it is 0.
-    """
-    dim = len(lo)
-    width = base or float((hi - lo).max()) / BASE[dim]
-    counts = np.maximum(np.ceil((hi - lo) / width - 1e-9).astype(int), 1)
-    start = (lo + hi) / 2 - counts * width / 2
-    index = np.stack(np.meshgrid(*map(np.arange, counts), indexing="ij"), axis=-1).reshape(-1, dim)
-    centers = start + (index + 0.5) * width
-    children = np.array(list(itertools.product((-0.25, 0.25), repeat=dim)))
-    done: list[Cells] = []
-    left: list[Cells] = []
-    changes = _sign_changes(np.sign(region.distance(centers)[0]).reshape(counts)).reshape(-1)
-    while len(centers):
-        distance, outward = region.distance(centers)
-        # Twice the half diagonal: a signed distance function may be wrong by that factor.
-        near = ~(np.abs(distance) > np.sqrt(dim) * width) | changes
-        wanted = near | (distance < 0) if inside else near
-        # Outside of the domain a user's spacing need not be defined: ask at the foot point.
-        feet = np.where((distance > 0)[:, None] & near[:, None], centers - distance[:, None] * outward, centers)
-        h = np.full(len(centers), np.inf)
-        h[wanted] = spacing(feet[wanted])
-        cells = Cells(centers, np.full(len(centers), width), distance, outward, h)
-        left.append(_take(cells, ~wanted))
-        done.append(_take(cells, wanted & (width <= fraction * h * (1 + 1e-9))))
-        split = wanted & (width > fraction * h * (1 + 1e-9))
-        # Near the boundary a split cell leaves about 2^(D - 1) behind, inside 2^D.
-        needed = float(((width / (fraction * h[split])) ** (dim if inside else dim - 1)).sum())
-        if needed > _MOST:
-            raise ValueError(
-                f"spacing: as small as {h[split].min():.3g} in a domain of size {(hi - lo).max():.3g} it takes about "
-                f"{needed:.2g} cells, more than {_MOST:.0e}; enlarge it, or narrow the bounds if they are far too wide"
-            )
-        split = centers[split]
-        centers = (split[:, None] + width * children).reshape(-1, dim)
-        changes = np.zeros(len(centers), bool)
-        width /= 2
-    return _join(done), _join(left)
-
-
-def _sign_changes(sign: np.ndarray) -> np.ndarray:
-    """Cells of a grid next to one of the other sign."""
-    changes = np.zeros(sign.shape, bool)
-    for axis in range(sign.ndim):
-        s, c = np.moveaxis(sign, axis, 0), np.moveaxis(changes, axis, 0)
-        other = s[1:] != s[:-1]
-        c[1:] |= other
-        c[:-1] |= other
-    return changes
-
-
-def _take(cells: Cells, mask: np.ndarray) -> Cells:
-    return Cells(*(field[mask] for field in cells))
-
-
-def _join(parts: list[Cells]) -> Cells:
-    return Cells(*(np.concatenate(fields) for fields in zip(*parts)))
-
-
 def fill(
     region: Region, spacing: Spacing, lo: np.ndarray, hi: np.ndarray, boundary: np.ndarray, seed: int, uniform: bool
 ) -> np.ndarray:
@@ -157,14 +73,19 @@ def fill(
     if len(lo) == 1:
         return _fill_line(region, spacing, np.sort(boundary[:, 0]))
     rng = np.random.default_rng(seed)
-    points = _scatter(region, spacing, lo, hi, rng, uniform)
-    points = points[_clear(region, points, boundary, spacing(points), 0.9 * CLEARANCE)]
+    if uniform:
+        points = lattice(region, float(spacing(lo[None])[0]), lo, hi, boundary, rng)
+        return points[np.argsort(morton(points, lo, hi), kind="stable")]
+    points = _scatter(region, spacing, lo, hi, rng)
+    points = points[clear(region, points, boundary, spacing(points), 0.9 * CLEARANCE)]
     if not len(points):
         return points
-    points = relax(region, points, boundary, spacing, 20)
-    points = _repair(region, points, boundary, spacing, rng)
-    points = relax(region, points, boundary, spacing, 10)
-    points = points[_clear(region, points, boundary, spacing(points), 0.8 * CLEARANCE)]
+    points = relax(region, points, boundary, len(boundary), spacing, 8)
+    points = repair(region, points, boundary, spacing, rng)
+    points = relax(region, points, boundary, len(boundary), spacing, 4)
+    for _ in range(2):
+        points = relax_uneven(region, points, boundary, spacing, 6)
+    points = points[clear(region, points, boundary, spacing(points), 0.8 * CLEARANCE)]
     return points[np.argsort(morton(points, lo, hi), kind="stable")]
 
 
@@ -197,162 +118,19 @@ def path_lengths(path: np.ndarray, spacing: Spacing) -> np.ndarray:
 
 
 def _scatter(
-    region: Region, spacing: Spacing, lo: np.ndarray, hi: np.ndarray, rng: np.random.Generator, uniform: bool
+    region: Region, spacing: Spacing, lo: np.ndarray, hi: np.ndarray, rng: np.random.Generator
 ) -> np.ndarray:
     """A start of the right density: octree cells of at most one particle each, dithered along a Morton curve."""
     dim = len(lo)
     fraction = _DENSITY[dim] ** (-1.0 / dim)
-    base, period = 0.0, float((hi - lo).max()) / 100
-    if uniform:  # cells of exactly one particle: the start is a jittered lattice
-        base = period = fraction * float(spacing(lo[None])[0])
-        base *= 2.0 ** max(0.0, np.floor(np.log2((hi - lo).max() / BASE[dim] / base)))
-    shift = rng.uniform(0.0, 0.5, dim) * period
-    cells, _ = refine(region, spacing, lo - shift, hi + shift, fraction, True, base)
+    shift = rng.uniform(0.0, 0.5, dim) * float((hi - lo).max()) / 100
+    cells, _ = refine(region, spacing, lo - shift, hi + shift, fraction, True)
     order = np.argsort(morton(cells.centers, lo, hi), kind="stable")
-    cells = _take(cells, order)
-    expected = np.cumsum(_DENSITY[dim] * (cells.widths / cells.spacing) ** dim) * (1 - 1e-9)
+    width = cells.widths[order]
+    expected = np.cumsum(_DENSITY[dim] * (width / cells.spacing[order]) ** dim) * (1 - 1e-9)
     chosen = np.diff(np.floor(expected + rng.uniform()), prepend=0.0) > 0
-    jitter = rng.uniform(-0.45, 0.45, (len(expected), dim)) * cells.widths[:, None]
-    points = (cells.centers + jitter)[chosen]
+    jitter = rng.uniform(-0.45, 0.45, (len(expected), dim)) * width[:, None]
+    points = (cells.centers[order] + jitter)[chosen]
     return points[region.distance(points)[0] < 0]
 
 
-def morton(points: np.ndarray, lo: np.ndarray, hi: np.ndarray) -> np.ndarray:
-    """Place of each point along a space-filling curve: interleaved bits of its coordinates."""
-    dim = points.shape[1]
-    bits = 60 // dim
-    scaled = np.clip((points - lo) / (hi - lo).max(), 0.0, 1.0) * (2**bits - 1)
-    code = np.zeros(len(points), dtype=np.int64)
-    for axis, q in enumerate(scaled.astype(np.int64).T):
-        for bit in range(bits):
-            code |= ((q >> bit) & 1) << (dim * bit + axis)
-    return code
-
-
-def relax(region: Region, points: np.ndarray, boundary: np.ndarray, spacing: Spacing, steps: int) -> np.ndarray:
-    """Let the particles repel each other and a fixed boundary; returns new points (M, D)."""
-    from scipy.spatial import cKDTree
-
-    points, count = points.copy(), len(points)
-    k = min(_NEIGHBOURS[points.shape[1]] + 1, count + len(boundary))
-    fixed = spacing(boundary)
-    for step in range(steps):
-        every = np.concatenate([points, boundary])
-        if step % 5 == 0:  # particles move by a few hundredths of a spacing, neighbours outlast some steps
-            h = np.concatenate([spacing(points), fixed])
-            found = cKDTree(every, balanced_tree=False, compact_nodes=False).query(points, k=k)[1][:, 1:]
-            scale = scaling(h[:count], h[found], points.shape[1])
-            reach = (scale * np.linalg.norm(points[:, None] - every[found], axis=2)) < 2.0
-            near = np.flatnonzero(((found >= count) & reach).any(axis=1))
-        points += h[:count, None] * repulsion(points, every, found, scale)
-        if len(near):
-            distance, outward = region.distance(points[near])
-            push = np.clip(distance + CLEARANCE * h[near], 0.0, 0.3 * h[near])
-            points[near] -= push[:, None] * outward
-    return points
-
-
-def scaling(h: np.ndarray, other: np.ndarray, dim: int) -> np.ndarray:
-    """One over the spacing (M, k) that counts between particles with h (M,) and their neighbours with other (M, k)."""
-    return 1.0 / ((1.0 - _LEAN[dim]) * h[:, None] + _LEAN[dim] * other)
-
-
-def repulsion(points: np.ndarray, every: np.ndarray, found: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    """One step (M, D) in spacings: forces q^-4 of the scaled distance q, cut off at 1.7 by the second shell."""
-    # Axis by axis: contiguous (M, k) arrays are several times faster here than (M, k, D) ones.
-    away = [x[:, None] - y[found] for x, y in zip(points.T, np.ascontiguousarray(every.T))]
-    square = sum(a * a for a in away)
-    q = np.maximum(square * scale * scale, 0.1)
-    force = np.maximum(1.0 / (q * q) - 1.7**-4, 0.0) / np.sqrt(np.maximum(square, 1e-300))
-    move = 0.05 * np.stack([(force * a).sum(axis=1) for a in away], axis=1)
-    size = np.linalg.norm(move, axis=1)
-    return move * np.minimum(1.0, 0.15 / np.maximum(size, 1e-300))[:, None]
-
-
-def _clear(region: Region, points: np.ndarray, boundary: np.ndarray, h: np.ndarray, clearance: float) -> np.ndarray:
-    """Mask of the points inside and away from the boundary by ``clearance`` spacings."""
-    from scipy.spatial import cKDTree
-
-    distance = region.distance(points)[0]
-    clear = distance < -clearance * h
-    # A first-order distance may be far too small where the function is steep; nobody near, nothing to keep clear of.
-    doubtful = np.flatnonzero((distance < 0) & ~clear)
-    clear[doubtful] = cKDTree(boundary).query(points[doubtful])[0] > 1.5 * h[doubtful]
-    return clear
-
-
-def _repair(
-    region: Region, points: np.ndarray, boundary: np.ndarray, spacing: Spacing, rng: np.random.Generator
-) -> np.ndarray:
-    """Drop particles that are crowded, put new ones into holes."""
-    from scipy.spatial import cKDTree
-
-    h = spacing(points)
-    gap, other = cKDTree(np.concatenate([points, boundary])).query(points, k=2)
-    crowded = gap[:, 1] < 0.6 * h
-    # Of a crowded pair of interior particles only one goes.
-    crowded &= ~((other[:, 1] > np.arange(len(points))) & (other[:, 1] < len(points)))
-    points, h = points[~crowded], h[~crowded]
-    every = np.concatenate([points, boundary])
-    tree = cKDTree(every)
-    # A hole is seen from the particles around it: step off in some directions, then away from whatever is nearest.
-    count = len(points)
-    direction = rng.normal(size=(_PROBES * count, points.shape[1]))
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    h = np.tile(h, _PROBES)
-    probes = np.tile(points, (_PROBES, 1)) + 0.8 * h[:, None] * direction
-    for step in range(6):
-        gap, nearest = tree.query(probes)
-        far = gap > (0.65 if step < 3 else 0.75) * h
-        probes, h, gap, nearest = probes[far], h[far], gap[far], nearest[far]
-        if step < 5:
-            probes = probes + (0.2 * h / gap)[:, None] * (probes - every[nearest])
-    probes = probes[region.distance(probes)[0] < 0]  # elsewhere a user's spacing need not be defined
-    h = spacing(probes)
-    gap = tree.query(probes)[0]
-    hole = np.flatnonzero(gap > _HOLE * h)
-    hole = hole[_clear(region, probes[hole], boundary, h[hole], CLEARANCE)]
-    return np.concatenate([points, probes[hole[thin(probes[hole], _HOLE * h[hole], -gap[hole] / h[hole])]]])
-
-
-def near_pairs(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Distances and indices (M, k) of as many neighbours as :func:`thin` can need, itself first."""
-    from scipy.spatial import cKDTree
-
-    return cKDTree(points).query(points, k=range(1, min(48, len(points)) + 1))
-
-
-def thin(
-    points: np.ndarray, radii: np.ndarray, priority: np.ndarray, pairs: tuple[np.ndarray, np.ndarray] | None = None
-) -> np.ndarray:
-    """Indices of a maximal subset with no two points closer than their radii; low priority values first."""
-    if len(points) < 2:
-        return np.arange(len(points))
-    order = np.argsort(priority, kind="stable")
-    rank = np.empty(len(points), int)
-    rank[order] = np.arange(len(points))
-    gap, other = near_pairs(points) if pairs is None else pairs
-    close = gap < np.minimum(radii[:, None], radii[other])
-    close[:, 0] = False
-    a, b = np.nonzero(close)[0], other[close]
-    a, b = np.concatenate([a, b]), np.concatenate([b, a])  # a list cut off at k need not be symmetric
-    state = np.zeros(len(points), int)  # 0 undecided, 1 taken, -1 dropped
-    while (state == 0).any():
-        live = (state[a] == 0) & (state[b] == 0)
-        a, b = a[live], b[live]
-        beaten = np.zeros(len(points), bool)
-        beaten[a[rank[b] < rank[a]]] = True
-        winners = (state == 0) & ~beaten
-        state[winners] = 1
-        losers = b[winners[a]]
-        state[losers] = -1
-    return np.flatnonzero(state == 1)
-
-
-def uncrowded(points: np.ndarray, h: np.ndarray, corners: int) -> np.ndarray:
-    """Indices without the boundary points closer than half a spacing to others across a sharp tip.
-
-    The first ``corners`` points always stay.
-    """
-    order = np.concatenate([np.zeros(corners), np.ones(len(points) - corners)])
-    return np.union1d(thin(points, 0.5 * h, order), np.arange(corners))

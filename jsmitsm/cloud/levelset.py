@@ -1,24 +1,21 @@
-"""The zero level of a signed-distance-like function: evaluation in batches, projection, boundary particles."""
+"""The zero level of a signed-distance-like function: projection, boundary particles, cells around."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 
 from jsmitsm.cloud import filling
-from jsmitsm.cloud.filling import Spacing
-from jsmitsm.runtime.compiled import fingerprint, kept
-from jsmitsm.runtime.errors import IN_FUNCTIONS, in_words
-from jsmitsm.runtime.jaxprs import inlined
-from jsmitsm.runtime.snapshot import snapshot
+from jsmitsm.cloud.packing import octree
+from jsmitsm.cloud.packing.octree import Spacing
+from jsmitsm.cloud.sdf.recorded import Recorded
 
-_BATCH = 1024  # every call is padded to this size: one compilation per function and dimension
 LEAST = 5.0  # spacings round a boundary component below which its shape is lost
+# Of the size of the domain: a point closer than the first lies on the zero level, one that comes no closer than the
+# second does not.
+_ON, _ARRIVED = 2e-15, 1e-13
 
 
 class Boundary(NamedTuple):
@@ -28,48 +25,42 @@ class Boundary(NamedTuple):
     normals: np.ndarray
 
 
-def _value_and_gradient(sdf: ClosedJaxpr, dim: int) -> Callable[[np.ndarray], tuple[jax.Array, jax.Array]]:
-    """Of a batch of points; one program for all functions that record the same."""
-    batch = jax.ShapeDtypeStruct((_BATCH, dim), jnp.float64)
-    closed = jax.make_jaxpr(jax.vmap(jax.value_and_grad(lambda x: jaxpr_as_fun(sdf)(x)[0])))(batch)
-    jaxpr = closed.jaxpr
-    program = kept(("sdf", fingerprint(jaxpr)), lambda: jax.jit(lambda consts, x: inlined(jaxpr, consts, [x])))
-    return lambda x: program(closed.consts, x)
-
-
 class SdfRegion:
     """The part of the box lo, hi where ``sdf`` is negative."""
 
     def __init__(self, sdf: Callable[..., Any], lo: np.ndarray, hi: np.ndarray):
         self.lo, self.hi = lo, hi
         self.size = float((hi - lo).max())
-        self._recorded = _value_and_gradient(_recorded(sdf, len(lo)), len(lo))
+        self._recorded = Recorded(sdf, len(lo))
         self._check_faces()
 
     def _check_faces(self) -> None:
         """Raise where the domain reaches through the box."""
         dim = len(self.lo)
         ticks = [np.linspace(a, b, {1: 2, 2: 257, 3: 41}[dim]) for a, b in zip(self.lo, self.hi)]
+        faces = []
         for axis in range(dim):
             for end in (self.lo, self.hi):
                 sides = [np.array([end[i]]) if i == axis else t for i, t in enumerate(ticks)]
-                x = np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1).reshape(-1, dim)
-                value = self.evaluate(x)[0]
-                if value.min() < -1e-9 * self.size:
-                    raise ValueError(
-                        f"bounds: cut the domain, sdf = {value.min():.3g} at {x[value.argmin()]} on a face of the box "
-                        f"from {self.lo} to {self.hi}; enlarge the bounds until sdf >= 0 on every face"
-                    )
+                faces.append(np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1).reshape(-1, dim))
+        x = np.concatenate(faces)
+        value = self.values(x)
+        if value.min() < -1e-9 * self.size:
+            raise ValueError(
+                f"bounds: cut the domain, sdf = {value.min():.3g} at {x[value.argmin()]} on a face of the box "
+                f"from {self.lo} to {self.hi}; enlarge the bounds until sdf >= 0 on every face"
+            )
 
-    def evaluate(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Values (M,) and gradients (M, D); outside of the box everything is positive."""
-        count = len(x)
-        value, gradient = np.empty(count), np.empty(x.shape)
-        for i in range(0, count, _BATCH):
-            part = x[i : i + _BATCH]
-            padded = np.concatenate([part, np.broadcast_to(part[:1], (_BATCH - len(part), x.shape[1]))])
-            v, g = self._recorded(padded)
-            value[i : i + _BATCH], gradient[i : i + _BATCH] = (np.asarray(a)[: len(part)] for a in (v, g))
+    def values(self, x: np.ndarray) -> np.ndarray:
+        """Values (M,); outside of the box everything is positive."""
+        return self.evaluate(x, False)[0]
+
+    def evaluate(self, x: np.ndarray, gradients: bool = True) -> tuple[np.ndarray, np.ndarray]:
+        """Values (M,) and, if asked for, gradients (M, D); outside of the box everything is positive."""
+        value, gradient = self._recorded(x, gradients)
+        if len(x) == 0 or (x.min(axis=0) >= self.lo).all() and (x.max(axis=0) <= self.hi).all():
+            if np.isfinite(value).all():
+                return value, gradient
         beyond = np.maximum(self.lo - x, x - self.hi)
         out = beyond.max(axis=1)
         bad = np.flatnonzero(~np.isfinite(value) & (out <= 0))
@@ -94,63 +85,41 @@ class SdfRegion:
         gradient[~good] = 0.0
         return value / slope, gradient / slope[:, None]
 
-    def project(self, x: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Newton steps of at most ``reach`` (M,) to the zero level; points (M, D) and whether they arrived."""
-        x = x.copy()
-        best, found = np.full(len(x), np.inf), x.copy()
-        live = np.arange(len(x))
+    def project(self, x: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Newton steps of at most ``reach`` (M,) to the zero level; points (M, D), whether they arrived, normals."""
+        found, normal = x.copy(), np.zeros(x.shape)
+        best = np.full(len(x), np.inf)
+        live, at = np.arange(len(x)), x
         for _ in range(40):
-            distance, outward = self.distance(x[live])
-            better = np.abs(distance) < best[live]
-            at = live[better]
-            best[at], found[at] = np.abs(distance[better]), x[at]
-            step = np.clip(distance, -reach[live], reach[live])
-            going = np.abs(distance) > 4e-16 * self.size
-            live, step, outward = live[going], step[going], outward[going]
+            distance, outward = self.distance(at)
+            off = np.abs(distance)
+            before = best[live]
+            better = off < before
+            kept = live[better]
+            best[kept], found[kept], normal[kept] = off[better], at[better], outward[better]
+            # What no longer improves is as close as its round-off lets it.
+            going = (off > _ON * self.size) & (better | (before > _ARRIVED * self.size))
+            live = live[going]
             if not len(live):
                 break
-            x[live] -= step[:, None] * outward
-        return found, best <= 1e-13 * self.size
+            step = np.clip(distance[going], -reach[live], reach[live])
+            at = at[going] - step[:, None] * outward[going]
+        return found, best <= _ARRIVED * self.size, normal
 
     def normals(self, x: np.ndarray) -> np.ndarray:
         """Unit gradients (M, D) at points of the zero level."""
-        outward = self.distance(x)[1]
-        lost = np.flatnonzero(~outward.any(axis=1))
-        if len(lost):
-            raise ValueError(
-                f"sdf: its gradient vanishes or is not finite at the boundary point {x[lost[0]]}; the function must "
-                "cross zero with a slope (not be a square or an absolute value)"
-            )
-        return outward
+        return crossing_normals(x, self.distance(x)[1])
 
 
-def _recorded(sdf: Any, dim: int) -> ClosedJaxpr:
-    """The function as it is now, of one point."""
-    if not callable(sdf):
-        raise ValueError(f"sdf: expected a function x (D,) -> scalar, got {sdf!r}")
-    if jax.dtypes.canonicalize_dtype(np.float64) != np.float64:
+def crossing_normals(x: np.ndarray, outward: np.ndarray) -> np.ndarray:
+    """The unit gradients (M, D) at points of the zero level (M, D), once there are some."""
+    lost = np.flatnonzero(~outward.any(axis=1))
+    if len(lost):
         raise ValueError(
-            "sdf: JAX computes in float32 here, boundary particles to 1e-10 need float64; put "
-            'jax.config.update("jax_enable_x64", True) at the beginning of the program'
+            f"sdf: its gradient vanishes or is not finite at the boundary point {x[lost[0]]}; the function must "
+            "cross zero with a slope (not be a square or an absolute value)"
         )
-    try:
-        closed, out = snapshot(sdf, jax.ShapeDtypeStruct((dim,), jnp.float64))
-    except IN_FUNCTIONS as error:
-        raise ValueError(
-            f"sdf: failed for one point x of shape ({dim},), the dimension of the bounds; write it with "
-            "jax.numpy, jnp.where in place of if, for points of that dimension "
-            f"({type(error).__name__}: {in_words(error).splitlines()[0]})"
-        ) from error
-    if getattr(out, "shape", None) != () or not jnp.issubdtype(out.dtype, jnp.floating):
-        raise ValueError(
-            f"sdf: returned {out} for one point x of shape ({dim},), expected a real scalar; "
-            "it is mapped over points here, write it for a single one"
-        )
-    if out.dtype != jnp.float64:
-        raise ValueError(
-            f"sdf: computes in {out.dtype}, float64 was expected; drop casts and constants of lower precision"
-        )
-    return closed
+    return outward
 
 
 def checked(region: SdfRegion, boundary: Boundary) -> Boundary:
@@ -166,10 +135,20 @@ def checked(region: SdfRegion, boundary: Boundary) -> Boundary:
     return boundary
 
 
-def cells_near(region: SdfRegion, spacing: Spacing, fraction: float) -> tuple[filling.Cells, filling.Cells]:
+def cells_near(
+    region: SdfRegion, spacing: Spacing, fraction: float
+) -> tuple[octree.Cells, octree.Cells]:
     """Octree cells near the zero level, and the coarse ones around; raises for an empty domain."""
-    pad = 1.01 * region.size / filling.BASE[len(region.lo)]
-    cells, coarse = filling.refine(region, spacing, region.lo - pad, region.hi + pad, fraction, False)
+    base = region.size / octree.BASE[len(region.lo)]
+    pad = 1.01 * base
+    # Off the middle: the centres of symmetric shapes, and lines on which the function touches zero, are not met.
+    shift = 0.1 * base * np.array([0.63, -0.41, 0.29])[: len(region.lo)]
+    if isinstance(spacing, filling.Constant):  # cells as wide as wanted at the end, not up to half as wide
+        wanted = fraction * spacing.value
+        base = min(base, wanted * 2.0 ** max(0.0, np.floor(np.log2(base / wanted))))
+    cells, coarse = octree.refine(
+        region, spacing, region.lo - pad + shift, region.hi + pad + shift, fraction, False, base
+    )
     if not ((cells.distance < 0).any() or (coarse.distance < 0).any()):
         raise ValueError(
             f"sdf: never negative in the bounds from {region.lo} to {region.hi} (looked at "
@@ -180,7 +159,7 @@ def cells_near(region: SdfRegion, spacing: Spacing, fraction: float) -> tuple[fi
 
 def root(region: SdfRegion, a: np.ndarray, b: np.ndarray, tolerance: float) -> np.ndarray:
     """Zeros on the segments from a to b (M, D), whose ends differ in sign: Illinois, bisection every third step."""
-    fa, fb = region.evaluate(a)[0], region.evaluate(b)[0]
+    fa, fb = region.values(a), region.values(b)
     s, t = np.zeros(len(a)), np.ones(len(a))
     result, live = np.zeros(len(a)), np.arange(len(a))
     for step in range(90):
@@ -188,7 +167,7 @@ def root(region: SdfRegion, a: np.ndarray, b: np.ndarray, tolerance: float) -> n
             u = np.where(step % 3 == 2, (s + t) / 2, s - fa * (t - s) / (fb - fa))
         u = np.clip(np.where(np.isfinite(u), u, (s + t) / 2), s, t)
         result[live] = u
-        f = region.evaluate(a[live] + u[:, None] * (b - a)[live])[0]
+        f = region.values(a[live] + u[:, None] * (b - a)[live])
         left = (f < 0) == (fa < 0)  # the zero lies between u and t
         s, t = np.where(left, u, s), np.where(left, t, u)
         fa, fb = np.where(left, f, fa / 2), np.where(left, fb / 2, f)

@@ -10,6 +10,7 @@ import jax
 import numpy as np
 
 from jsmitsm.cloud.cloud import Cloud
+from jsmitsm.cloud.regions.region_cloud import RegionCloud
 from jsmitsm.particle.kernels import EDGE
 from jsmitsm.runtime.arrays import Array, ArrayLike
 from jsmitsm.runtime.errors import short
@@ -67,6 +68,7 @@ def stencils(cloud: Cloud, *, size: int | None = None, radius: ArrayLike | None 
 
     Parameters
     ----------
+    cloud : in one of several regions neighbours are of the same region.
     size : the number of nearest particles, the particle itself counted. Particles as far as the
         last one enter as well, so that a lattice gets closed shells.
     radius : all particles within this distance (a scalar or one per particle, length units),
@@ -94,12 +96,29 @@ def stencils(cloud: Cloud, *, size: int | None = None, radius: ArrayLike | None 
         )
     if (size is None) == (radius is None):
         raise ValueError(f"stencils: give either size or radius, got size={short(size)} and radius={short(radius)}")
+    if isinstance(cloud, RegionCloud):
+        return _of_regions(cloud, size, radius)
     points = np.asarray(cloud.points)
     if size is None:
         return within(points, radius)
     if isinstance(size, bool) or not isinstance(size, (int, np.integer)) or size < 2:
         raise ValueError(f"size: expected a whole number of at least 2 (the particle itself counts), got {short(size)}")
     return nearest(points, int(size))
+
+
+def _of_regions(cloud: RegionCloud, size: int | None, radius: ArrayLike | None) -> Stencils:
+    """Every particle's neighbours in its own region, numbered in the whole cloud."""
+    found = []
+    for name, ids in cloud.regions.items():
+        own = None if radius is None else np.broadcast_to(np.asarray(radius), (len(cloud),))[ids]
+        found.append((ids, stencils(cloud.region(name), size=size, radius=own)))
+    near = np.full((len(cloud), max(one.width for _, one in found)), -1, np.int32)
+    reach = np.zeros(len(cloud))
+    for ids, one in found:
+        index = np.asarray(one.indices)
+        near[ids[:, None], np.arange(one.width)] = np.where(index >= 0, ids[index], -1)
+        reach[ids] = one.radius
+    return Stencils(near, reach)
 
 
 def nearest(points: np.ndarray, size: int, which: np.ndarray | None = None) -> Stencils:

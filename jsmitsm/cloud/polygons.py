@@ -8,7 +8,9 @@ from typing import Any
 import numpy as np
 
 from jsmitsm.cloud import filling, levelset
-from jsmitsm.cloud.filling import Spacing
+from jsmitsm.cloud.line.path import followed
+from jsmitsm.cloud.packing import relaxation
+from jsmitsm.cloud.packing.octree import Spacing
 
 _SHARP = np.deg2rad(20.0)  # a vertex that turns by more is a corner of the shape, not a sample of a curve
 
@@ -116,14 +118,48 @@ def _inside(x: np.ndarray, loops: list[np.ndarray]) -> np.ndarray:
     return result
 
 
-def edge_particles(loop: np.ndarray, spacing: Spacing, name: str) -> levelset.Boundary:
-    """Particles (B, 2) on the edges of a polygon and at its corners, outward normals right of the way."""
-    ahead = np.roll(loop, -1, axis=0)
-    edge = ahead - loop
+def _turns(loop: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The outward normals of the edges behind and before each vertex of a loop, and the angle between them."""
+    edge = np.roll(loop, -1, axis=0) - loop
     normal = np.stack([edge[:, 1], -edge[:, 0]], axis=1) / np.linalg.norm(edge, axis=1, keepdims=True)
     before = np.roll(normal, 1, axis=0)
-    turn = np.arctan2(np.abs(before[:, 0] * normal[:, 1] - before[:, 1] * normal[:, 0]), (before * normal).sum(axis=1))
-    paths = [_sampled(a, b, spacing) for a, b in zip(loop, ahead)]
+    across = np.abs(before[:, 0] * normal[:, 1] - before[:, 1] * normal[:, 0])
+    return normal, before, np.arctan2(across, (before * normal).sum(axis=1))
+
+
+def sharp_vertices(loop: np.ndarray) -> np.ndarray:
+    """Those vertices (C, 2) of a loop that are corners of the shape."""
+    return loop[_turns(loop)[2] > _SHARP]
+
+
+def with_vertices(loop: np.ndarray, forced: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A loop with the points ``forced`` (C, 2) that lie on its edges as vertices, and which vertices these are."""
+    size = np.ptp(loop, axis=0).max()
+    start, step = loop, np.roll(loop, -1, axis=0) - loop
+    square = (step * step).sum(axis=1)
+    along = ((forced[:, None] - start) * step).sum(axis=2) / square
+    away = np.linalg.norm(start + np.clip(along, 0.0, 1.0)[..., None] * step - forced[:, None], axis=2)
+    point, edge = np.nonzero(away <= 1e-9 * size)
+    position = edge + np.clip(along[point, edge], 0.0, 1.0)
+    gap = np.abs(forced[point][:, None] - loop[None]).max(axis=2).min(axis=1, initial=np.inf)
+    new = gap > 1e-9 * size
+    forced_at = np.unique(np.abs(forced[point][~new][:, None] - loop[None]).max(axis=2).argmin(axis=1))
+    order = np.argsort(np.concatenate([np.arange(len(loop)), position[new]]), kind="stable")
+    points = np.concatenate([loop, forced[point][new]])[order]
+    mask = np.concatenate([np.isin(np.arange(len(loop)), forced_at), np.ones(int(new.sum()), bool)])[order]
+    return points, mask
+
+
+def edge_particles(
+    loop: np.ndarray, forced: np.ndarray | None = None, *, spacing: Spacing, name: str
+) -> levelset.Boundary:
+    """Particles (B, 2) on the edges of a polygon and at its corners, outward normals right of the way.
+
+    forced (V,) bool: vertices that are particles in any case.
+    """
+    ahead = np.roll(loop, -1, axis=0)
+    normal, before, turn = _turns(loop)
+    paths = [followed(a, b, spacing) for a, b in zip(loop, ahead)]
     lengths = np.array([filling.path_lengths(path, spacing)[-1] for path in paths])
     if lengths.sum() < levelset.LEAST:
         raise ValueError(
@@ -131,6 +167,8 @@ def edge_particles(loop: np.ndarray, spacing: Spacing, name: str) -> levelset.Bo
             f"at least {levelset.LEAST:g} are needed"
         )
     sharp = turn > _SHARP
+    if forced is not None:
+        sharp = sharp | forced
     tight = np.flatnonzero(sharp & np.roll(sharp, -1) & (lengths < 0.1))
     if len(tight):
         raise ValueError(
@@ -154,26 +192,21 @@ def edge_particles(loop: np.ndarray, spacing: Spacing, name: str) -> levelset.Bo
     at, outward = np.concatenate(points), np.concatenate(normals)
     firsts = np.cumsum([0] + [len(part) for part in points[:-1]])  # the vertices that are kept
     order = np.concatenate([firsts, np.setdiff1d(np.arange(len(at)), firsts)])
-    order = order[filling.uncrowded(at[order], spacing(at[order]), len(firsts))]
+    order = order[relaxation.uncrowded(at[order], spacing(at[order]), len(firsts))]
     return levelset.Boundary(at[np.sort(order)], outward[np.sort(order)])
-
-
-def _sampled(a: np.ndarray, b: np.ndarray, spacing: Spacing) -> np.ndarray:
-    """Points along an edge, close enough together to follow a variable spacing."""
-    path = a + np.linspace(0.0, 1.0, 17)[:, None] * (b - a)
-    count = min(100_000, int(8 * filling.path_lengths(path, spacing)[-1]))
-    return path if count < 17 else a + np.linspace(0.0, 1.0, count)[:, None] * (b - a)
 
 
 class PolygonRegion:
     """Signed distance of a polygon with holes, by the nearest of many short pieces of its edges."""
+
+    piecewise = True
 
     def __init__(self, loops: list[np.ndarray], spacing: Spacing):
         from scipy.spatial import cKDTree
 
         self._loops = loops
         chains = [
-            filling.divide(_sampled(a, b, spacing), spacing)[0]
+            filling.divide(followed(a, b, spacing), spacing)[0]
             for loop in loops
             for a, b in zip(loop, np.roll(loop, -1, axis=0))
         ]

@@ -9,6 +9,7 @@ import numpy as np
 
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.cloud.domain_quadrature import domain_rule
+from jsmitsm.cloud.regions.region_cloud import RegionCloud, sides
 from jsmitsm.cloud.triangulation import boundary_facets
 from jsmitsm.taylor.multi_indices import multi_indices
 
@@ -42,7 +43,8 @@ def quadrature(cloud: Cloud, group: str | None = None, degree: int = 8) -> Quadr
     Between neighbouring boundary particles lie cubic facets that follow their normals (curved PN
     triangles, Vlachos et al. 2001, and their counterpart in 2D), flat at corners and where the
     cloud has no normals. A facet belongs to the group whose normals it continues. The
-    error is O(spacing^4) on smooth boundaries, none on straight ones.
+    error is O(spacing^4) on smooth boundaries, none on straight ones. Over the domain of a cloud of several regions
+    the rules of all stand one after another; over an interface ``"a|b"`` the normals point from a to b.
 
     Raises ValueError for a group that is no boundary group, and a degree that is no whole number from 1.
 
@@ -57,6 +59,8 @@ def quadrature(cloud: Cloud, group: str | None = None, degree: int = 8) -> Quadr
     """
     if isinstance(degree, bool) or not isinstance(degree, (int, np.integer)) or degree < 1:
         raise ValueError(f"degree: expected a whole number from 1, got {degree!r}")
+    if isinstance(cloud, RegionCloud):
+        return _of_regions(cloud, group, degree)
     if group is None:
         at, weights = domain_rule(cloud, int(degree))
         return Quadrature(at, weights, np.full(at.shape, np.nan))
@@ -70,6 +74,17 @@ def quadrature(cloud: Cloud, group: str | None = None, degree: int = 8) -> Quadr
         return Quadrature(points[facets[:, 0]], np.ones(len(facets)), normal)
     net = _control_net(points[facets], _vertex_normals(cloud, facets, normal))
     return _gauss(net, normal)
+
+
+def _of_regions(cloud: RegionCloud, group: str | None, degree: int) -> Quadrature:
+    """That of all regions together; of an interface once, with its normals from the first region to the second."""
+    parts = [cloud.region(name) for name in cloud.regions]
+    if group in cloud.interfaces:
+        parts = [cloud.region(sides(str(group))[0])]
+    elif group is not None:
+        parts = [part for part in parts if group in part.groups] or parts[:1]
+    made = [quadrature(part, group, degree) for part in parts]
+    return Quadrature(*(np.concatenate(arrays) for arrays in zip(*made)))
 
 
 def _members(cloud: Cloud, facets: np.ndarray, normal: np.ndarray, group: str) -> np.ndarray:

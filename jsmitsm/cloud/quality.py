@@ -8,6 +8,7 @@ import numpy as np
 
 from jsmitsm.cloud import filling
 from jsmitsm.cloud.cloud import INTERIOR, Cloud
+from jsmitsm.cloud.regions.region_cloud import RegionCloud
 
 
 class Quality(NamedTuple):
@@ -30,6 +31,7 @@ def quality(cloud: Cloud, spacing: filling.SpacingLike | None = None) -> Quality
     Parameters
     ----------
     cloud : a :class:`Cloud`. With normals the boundary is told exactly; without them the domain is taken to be convex.
+        Of several regions the worst of each measure counts.
     spacing : a number or a function (M, D) -> (M,); by default the mean nearest distance near each particle.
 
     Returns
@@ -46,6 +48,11 @@ def quality(cloud: Cloud, spacing: filling.SpacingLike | None = None) -> Quality
     >>> round(js.quality(js.rectangle((0, 0), (1, 1), (11, 11))).mesh_ratio, 3)
     1.414
     """
+    if isinstance(cloud, RegionCloud):
+        parts = [quality(cloud.region(name), spacing) for name in cloud.regions]
+        least = ("separation", "evenness", "separation_distance")
+        worst = {name: (min if name in least else max)(getattr(q, name) for q in parts) for name in Quality._fields}
+        return Quality(**worst)
     from scipy.spatial import cKDTree
 
     points = np.asarray(cloud.points)

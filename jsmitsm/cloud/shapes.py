@@ -9,7 +9,8 @@ import numpy as np
 
 from jsmitsm.cloud import contour, filling, levelset, polygons, surface
 from jsmitsm.cloud.cloud import INTERIOR, Cloud
-from jsmitsm.cloud.filling import Spacing, SpacingLike
+from jsmitsm.cloud.filling import SpacingLike
+from jsmitsm.cloud.packing.octree import Region, Spacing
 from jsmitsm.runtime.arrays import ArrayLike
 from jsmitsm.runtime.errors import short
 from jsmitsm.runtime.progress import bar
@@ -55,8 +56,9 @@ def from_sdf(
         nothing, or some particle is claimed by none.
 
     The boundary is found by marching triangles on an octree refined to the spacing and projected with Newton's
-    method; the interior is filled by dithering and relaxed by short-range repulsion (in the spirit of Fornberg and
-    Flyer, Comput. Math. Appl. 69, 2015, and of Slak and Kosec, SIAM J. Sci. Comput. 41, 2019).
+    method. The interior is a lattice, a little disordered, relaxed near the boundary by short-range repulsion; where
+    the spacing varies it is filled by dithering and relaxed everywhere (in the spirit of Fornberg and Flyer, Comput.
+    Math. Appl. 69, 2015, and of Slak and Kosec, SIAM J. Sci. Comput. 41, 2019).
 
     >>> import jsmitsm as js
     >>> plate = js.sdf.difference(js.sdf.rectangle((0, 0), (2, 1)), js.sdf.circle((1, 0.5), 0.25))
@@ -65,16 +67,16 @@ def from_sdf(
     >>> sorted(cloud.groups), len(cloud.groups["hole"])
     (['hole', 'interior', 'outer'], 31)
     """
-    lo, hi = _checked_bounds(bounds)
+    lo, hi = checked_bounds(bounds)
     rule = filling.spacing_function(spacing)
     region = levelset.SdfRegion(sdf, lo, hi)
-    seed = _checked_seed(seed)
+    seed = checked_seed(seed)
     if len(lo) == 3:
         boundary = surface.surface(region, rule, seed)
     else:
         boundary = (contour.line if len(lo) == 1 else contour.contour)(region, rule)
     boundary = levelset.checked(region, boundary)
-    named = _grouped(boundary.points, groups) if groups is not None else {"boundary": np.arange(len(boundary.points))}
+    named = grouped(boundary.points, groups) if groups is not None else {"boundary": np.arange(len(boundary.points))}
     return _cloud(region, rule, lo, hi, boundary, named, seed, not callable(spacing))
 
 
@@ -120,21 +122,21 @@ def from_polygon(
     names = ["vertices"] + [f"holes[{k}]" for k in range(len(loops) - 1)]
     polygons.check_crossings(loops, names)
     polygons.check_nesting(loops, names)
-    seed = _checked_seed(seed)
-    parts = [polygons.edge_particles(loop, rule, name) for loop, name in zip(loops, names)]
+    seed = checked_seed(seed)
+    parts = [polygons.edge_particles(loop, spacing=rule, name=name) for loop, name in zip(loops, names)]
     boundary = levelset.Boundary(*(np.concatenate(arrays) for arrays in zip(*parts)))
     if groups is None:
         ends = np.cumsum([0] + [len(part.points) for part in parts])
         labels = ["boundary"] + [f"hole{k}" for k in range(len(loops) - 1)]
         named = {label: np.arange(i, j) for label, i, j in zip(labels, ends[:-1], ends[1:])}
     else:
-        named = _grouped(boundary.points, groups)
+        named = grouped(boundary.points, groups)
     lo, hi = loops[0].min(axis=0), loops[0].max(axis=0)
     return _cloud(polygons.PolygonRegion(loops, rule), rule, lo, hi, boundary, named, seed, not callable(spacing))
 
 
 def _cloud(
-    region: filling.Region,
+    region: Region,
     spacing: Spacing,
     lo: np.ndarray,
     hi: np.ndarray,
@@ -150,15 +152,15 @@ def _cloud(
             "spacing: too coarse for the shape, no interior particle fits half a spacing away from its "
             f"{len(boundary.points)} boundary particles; reduce it well below the width of the shape"
         )
-    boundary = levelset.Boundary(boundary.points, _own_normals(region, spacing, boundary, named))
+    boundary = levelset.Boundary(boundary.points, own_normals(region, spacing, boundary, named))
     index = {INTERIOR: np.arange(len(inside))}
     index |= {name: members + len(inside) for name, members in named.items()}
     normals = np.concatenate([np.full(inside.shape, np.nan), boundary.normals])
     return Cloud(np.concatenate([inside, boundary.points]), index, normals)
 
 
-def _own_normals(
-    region: filling.Region, spacing: Spacing, boundary: levelset.Boundary, named: dict[str, np.ndarray]
+def own_normals(
+    region: Region, spacing: Spacing, boundary: levelset.Boundary, named: dict[str, np.ndarray]
 ) -> np.ndarray:
     """The normals (B, D), at corners between groups those of the own side: what is said of a side holds to its end."""
     points, normals = boundary
@@ -178,7 +180,7 @@ def _own_normals(
     at, which = np.nonzero(own)
     # A little towards a neighbour on the own side the distance grows along that side's normal.
     step, little = points[near[at, which]] - points[at], 1e-7
-    if isinstance(region, polygons.PolygonRegion):  # known by distances: off its edges, and farther for the digits
+    if getattr(region, "piecewise", False):  # known by distances to edges: off them, and farther for the digits
         step += 0.1 * np.linalg.norm(step, axis=1, keepdims=True) * normals[at]
         little = 1e-3
     side = region.distance(points[at] + little * step)[1]
@@ -190,7 +192,7 @@ def _own_normals(
     return np.where(length > 0, total / np.where(length > 0, length, 1.0), normals)
 
 
-def _grouped(points: np.ndarray, groups: Mapping[str, Predicate]) -> dict[str, np.ndarray]:
+def grouped(points: np.ndarray, groups: Mapping[str, Predicate]) -> dict[str, np.ndarray]:
     """Indices of the boundary points that each predicate is the first to claim."""
     if not isinstance(groups, Mapping) or not groups or not all(map(callable, groups.values())):
         raise ValueError(
@@ -223,13 +225,13 @@ def _grouped(points: np.ndarray, groups: Mapping[str, Predicate]) -> dict[str, n
     return named
 
 
-def _checked_seed(seed: Any) -> int:
+def checked_seed(seed: Any) -> int:
     if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
         raise ValueError(f"seed: expected a whole number >= 0, got {seed!r}")
     return int(seed)
 
 
-def _checked_bounds(bounds: Any) -> tuple[np.ndarray, np.ndarray]:
+def checked_bounds(bounds: Any) -> tuple[np.ndarray, np.ndarray]:
     """The corners of the box as two float arrays (D,)."""
     try:
         lo, hi = (np.atleast_1d(np.asarray(corner, dtype=np.float64)) for corner in bounds)

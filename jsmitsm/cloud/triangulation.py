@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from jsmitsm.cloud.cloud import Cloud
+from jsmitsm.cloud.regions.region_cloud import RegionCloud
 
 # A simplex whose longest edge exceeds this many usual edges of its corners bridges a gap; the first
 # number is for clouds without boundary, the second for simplices with boundary particles only, the suspects.
@@ -19,11 +20,14 @@ def simplices(cloud: Cloud) -> np.ndarray:
     A simplex with boundary particles at all its corners lies outside where the normals point into it. Where normals
     are missing, it is dropped if its longest edge is much longer than the usual edges of its corners.
     Without normals the very corner of a notch may be filled, and what a particle on the very boundary sees across it.
+    Those of a cloud of several regions do not cross an interface.
 
     >>> import jsmitsm as js
     >>> simplices(js.rectangle((0, 0), (1, 1), (3, 3))).shape
     (8, 3)
     """
+    if isinstance(cloud, RegionCloud):
+        return np.concatenate([ids[simplices(cloud.region(name))] for name, ids in cloud.regions.items()])
     points = _scaled(cloud)
     cells = _intervals(points) if cloud.dim == 1 else _delaunay(points).simplices
     return cells[_solid(points, cells) & ~_outside(cloud, points, cells)]

@@ -12,6 +12,7 @@ import numpy as np
 from jsmitsm.discretization.degenerate import Degenerate, settled
 from jsmitsm.discretization.layout import Discretization, crowded
 from jsmitsm.discretization.periodic import with_corners
+from jsmitsm.discretization.resolution.kinks import softened
 from jsmitsm.equation.conditions import group_conditions, merged
 from jsmitsm.equation.problem import Problem
 from jsmitsm.particle.recursion import Recursion, source_rows
@@ -60,6 +61,9 @@ def numbers(disc: Discretization, problem: Problem, taylor: Any = None, everywhe
     ids = np.arange(len(disc.cloud)) if everywhere else disc.active
     here = None if taylor is None else picked(taylor, ids)
     jac, source = operator_numbers(disc, problem, picked(disc.cloud.points, ids), here)
+    if disc.rec.depth and disc.linear and disc.traced.source == "variable" and disc.traced.kinked:
+        values = -disc.traced.residuals(disc.cloud.points, params=problem.params)
+        source = softened(disc, ids, source, values)
     held = [((group.ids, k), value()) for group in disc.groups for k, value in group.held.items()]
     own_ids, own, given = _own_numbers(disc, taylor)
     data, gamma = _data_numbers(disc, taylor)

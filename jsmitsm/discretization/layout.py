@@ -11,6 +11,7 @@ import numpy as np
 
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.cloud.neighbours import Stencils
+from jsmitsm.cloud.regions.region_cloud import RegionCloud
 from jsmitsm.cloud.walls import Walls, seen
 from jsmitsm.discretization.periodic import Images, periodic_images, with_corners
 from jsmitsm.discretization.supports import check_supports, cut_off, default_kernel, find_stencils, walls_of
@@ -19,6 +20,7 @@ from jsmitsm.equation.closing import closed
 from jsmitsm.equation.conditions import Group, group_conditions
 from jsmitsm.equation.field import RATE
 from jsmitsm.equation.problem import Problem
+from jsmitsm.equation.regions.per_region import PerRegion
 from jsmitsm.equation.traced import Traced
 from jsmitsm.equation.tracing import trace
 from jsmitsm.particle.elimination import Scheme
@@ -102,12 +104,14 @@ class Discretization:
 
 def discretize(
     problem: Problem, cloud: Cloud, method: str, order: int, kernel: Kernel | None,
-    stencils: Stencils | None, basis_terms: int | None, sources: bool = True, depth: int | str = 0,
+    stencils: Stencils | None, basis_terms: int | None, sources: bool = True, depth: int | str = "auto",
 ) -> Discretization:  # fmt: skip
     """Trace the problem, lay out its recursion and conditions, and find neighbours.
 
     sources: whether the weights of the source are wanted even where it is zero.
     """
+    if isinstance(cloud, RegionCloud) or isinstance(problem.pde, PerRegion):
+        raise ValueError("problem: several regions are solved by js.solve alone; this is not made for them")
     kernel = kernel and kernel.recorded()
     traced = _traced(problem, cloud.dim)
     _check_operator(traced, problem, order)

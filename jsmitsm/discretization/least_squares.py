@@ -51,15 +51,15 @@ def least_squares_right_side(disc: Discretization, nums: Numbers, parts: list[tu
 def misfit(disc: Discretization, nums: Numbers, values: Any) -> np.ndarray:
     """By how much each particle's value (N, F) misses its local fit, in the least-squares form."""
     shared, there = shared_elimination(disc, nums), around(disc, nums)
-    own, found = slice(0, disc.rec.fields), []
+    own, found = slice(0, disc.rec.fields), np.zeros(len(disc.cloud))
     for cls in _fitted(disc, nums):
         block = _class_blocks(disc, nums, cls, shared, there)
         near = np.maximum(disc.images.owners(cls.neighbours), 0)
         data = [np.asarray(x)[near].reshape(len(near), -1) for x in (values, nums.gamma)]
         fitted = np.einsum("nij,nj->ni", np.asarray(block.matrix)[:, own], np.concatenate(data, axis=1))
         load = np.einsum("nir,nr->ni", np.asarray(block.right)[:, own], _right_values(disc, nums, cls))
-        found.append(np.abs(fitted - load).max(axis=1))
-    return np.concatenate(found)
+        found[cls.ids] = np.abs(fitted - load).max(axis=1)
+    return found[nums.ids]
 
 
 def _unknown_count(disc: Discretization) -> int:

@@ -75,11 +75,11 @@ def right_side(disc: Discretization, nums: Numbers, classes: list[Class], rows: 
         own = unknown[cls.ids]
         parts.append((row, source if cls.scheme.sourced else None, given, near, np.flatnonzero(own >= 0)))
         places.append(own[own >= 0])
-    return _loads(parts, nums.held, nums.gamma, np.argsort(np.concatenate(places))) if parts else np.zeros(0)
+    return loads(parts, nums.held, nums.gamma, np.argsort(np.concatenate(places))) if parts else np.zeros(0)
 
 
 @in_one_program
-def _loads(parts: Sequence[Any], held: Any, gamma: Any, order: np.ndarray) -> Any:
+def loads(parts: Sequence[Any], held: Any, gamma: Any, order: np.ndarray) -> Any:
     """The right-hand side from every class's row, source, own conditions, neighbours and places."""
     xp = jnp if is_traced(parts, held, gamma) else np
     found = []

@@ -49,13 +49,13 @@ def operands(disc: Discretization, nums: Numbers, cls: Class, shared: Eliminatio
     """What the particles of a class need; the particle axis first."""
     ids, jac, lengths = cls.ids, nums.jac, None
     if jac.shape[-1] > 1:
-        jac = _particles_first(jac, np.searchsorted(nums.ids, ids), len(ids))
+        jac = particles_first(jac, np.searchsorted(nums.ids, ids), len(ids))
     elif shared is not None:
         jac = np.zeros((1, 1, 1, 1))
     else:
         some = _eliminations(disc, nums, cls)
         if some is None:
-            jac = _particles_first(jac, None, 1)
+            jac = particles_first(jac, None, 1)
         else:
             shared, lengths, jac = some
     return Operands(jac, own_conditions(nums, cls), data, shared, lengths)
@@ -107,14 +107,14 @@ def right_sides(disc: Discretization, nums: Numbers, cls: Class) -> tuple[Any, A
     """The recursion's right-hand side (n, rows) and the own conditions' values (n, n_own)."""
     n, source = len(cls.ids), nums.source
     here = np.searchsorted(nums.ids, cls.ids) if source.shape[1] > 1 else None
-    source = _particles_first(source, here, n)
+    source = particles_first(source, here, n)
     if not cls.scheme.n_own:
         return source, np.zeros((n, 0))
     return source, _first_columns(nums.given, np.searchsorted(nums.own_ids, cls.ids), cls.scheme.n_own)
 
 
 @partial(in_one_program, static=("n",))
-def _particles_first(values: Any, here: np.ndarray | None, n: int) -> Any:
+def particles_first(values: Any, here: np.ndarray | None, n: int) -> Any:
     """The n particles ``here`` of an array with the particle axis last, that axis first; None: one serves all."""
     xp = jnp if is_traced(values) else np
     values = xp.asarray(values)

@@ -68,8 +68,9 @@ def cell_peclet(disc: Discretization, nums: Numbers) -> float:
 
 
 def usual_condition(disc: Discretization) -> float:
-    """Of the order of the condition of a regular system: n^(m/D) for an operator of order m."""
-    return float(len(disc.cloud) ** (max(disc.rec.orders) / disc.rec.dim))
+    """Of the order of the condition of a regular system: n^(m/D) for an operator of order m, times the contrast of
+    conductivities where there are several regions."""
+    return float(len(disc.cloud) ** (max(disc.rec.orders) / disc.rec.dim)) * getattr(disc, "contrast", 1.0)
 
 
 def wave_number(disc: Discretization, nums: Numbers) -> float:

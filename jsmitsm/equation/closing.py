@@ -24,11 +24,16 @@ def closed(problem: Problem, traced: Traced) -> Problem:
     """
     if problem.pde is traced:
         return problem
+    return with_recorded(problem, traced, traced.dim)
+
+
+def with_recorded(problem: Problem, pde: Any, dim: int) -> Problem:
+    """The problem with the record ``pde`` (of every region, where there are several) and its conditions recorded."""
     new = object.__new__(Problem)
     new.fields, new.params = problem.fields, jax.tree.map(owned, problem.params)
-    new.pde = traced  # type: ignore[assignment]
+    new.pde = pde
     new.bcs = {
-        name: [_closed_condition(problem, c, traced.dim, f"bcs[{name!r}]") for c in conditions]
+        name: [_closed_condition(problem, c, dim, f"bcs[{name!r}]") for c in conditions]
         for name, conditions in problem.bcs.items()
     }
     return new
@@ -40,9 +45,12 @@ def _closed_condition(problem: Problem, c: Condition, dim: int, where: str) -> C
     def one(name: str, part: Any) -> Any:
         if not callable(part):
             return owned(part)
-        if c.kind == "condition":
+        if c.kind == "condition" or name in ("one", "two"):
             return recorded_residual(part, dim, problem, where)
-        return recorded_values(part, dim, problem.params, components, f"{where}.{name}")
+        if name == "residual":
+            return recorded_between(part, dim, problem, where)
+        count = 1 if name == "resistance" else components
+        return recorded_values(part, dim, problem.params, count, f"{where}.{name}")
 
     return Condition(c.kind, c.field, **{name: one(name, part) for name, part in c.parts.items()})
 
@@ -57,6 +65,19 @@ def recorded_residual(residual: Callable[..., Any], dim: int, problem: Problem, 
     arguments = "u, x, n" if problem.params is None else "u, x, n, params"
     with _named(where, f"residual({arguments}) returning a scalar or a vector"):
         return trace(residual, dim, problem.fields, extras=((dim,),), params=problem.params)
+
+
+def recorded_between(residual: Callable[..., Any], dim: int, problem: Problem, where: str) -> Traced:
+    """The record of residual(a, b, x, n): of a field with the components of both sides, those of a first."""
+    fields = problem.fields
+
+    def both(u: Any, x: Any, n: Any, *params: Any) -> Any:
+        a, b = (u[0], u[1]) if fields == 1 else (u[:fields], u[fields:])
+        return residual(a, b, x, n, *params)
+
+    arguments = "a, b, x, n" if problem.params is None else "a, b, x, n, params"
+    with _named(where, f"residual({arguments}) returning a scalar or a vector"):
+        return trace(both, dim, 2 * fields, extras=((dim,),), params=problem.params)
 
 
 @contextmanager

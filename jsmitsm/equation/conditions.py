@@ -97,7 +97,7 @@ def group_conditions(problem: Problem, cloud: Cloud, order: int, orders: tuple[i
         if name == INTERIOR and len(pinned) < len(conditions):
             raise ValueError('bcs: "interior" takes no boundary condition; hold single particles with js.fix')
         groups += [_laid_out(problem, cloud, name, np.array(c.indices), [c], order, highest) for c in pinned]
-        rest = [c for c in conditions if c.kind not in ("fix", "periodic", "free")]
+        rest = [c for c in conditions if c.kind not in ("fix", "periodic", "free", "interface")]
         if rest:
             groups.append(_laid_out(problem, cloud, name, cloud.groups[name], rest, order, highest))
             counts[name] = len(groups[-1].held) + groups[-1].n_rows
@@ -172,7 +172,7 @@ def _laid_out(problem, cloud, name, ids, conditions: list[Condition], order: int
             for k in fields:
                 if k in group.held:
                     raise ValueError(f"{where}: the value of field {k} is given twice; remove one of the conditions")
-                group.held[k] = _component(problem, points, c.value, c.field, k, f"{where}.value")
+                group.held[k] = component(problem, points, c.value, c.field, k, f"{where}.value")
         else:
             normals = _normals(cloud, ids, where)
             for part in _parts(problem, points, normals, c, where):
@@ -213,7 +213,7 @@ def _normals(cloud: Cloud, ids: np.ndarray, where: str) -> Any:
     return normals
 
 
-def _component(problem: Problem, points: Any, value: Any, named: int | None, k: int, where: str) -> Callable[[], Any]:
+def component(problem: Problem, points: Any, value: Any, named: int | None, k: int, where: str) -> Callable[[], Any]:
     """The value of field k over a group, (n,), computed when asked for."""
     n, several = points.shape[0], problem.fields > 1 and named is None
 
@@ -258,7 +258,7 @@ def _parts(problem: Problem, points: Any, normals: Any, c: Condition, where: str
     zero = (0,) * dim
     parts = []
     for k in fields:
-        get = lambda name, k=k: _component(problem, points, c.parts[name], c.field, k, f"{where}.{name}")()  # noqa: E731
+        get = lambda name, k=k: component(problem, points, c.parts[name], c.field, k, f"{where}.{name}")()  # noqa: E731
         if c.kind == "neumann":
 
             def numbers(_, get=get):

@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from jsmitsm.equation.regions.per_region import PerRegion, per_region
 from jsmitsm.equation.traced import Traced
 from jsmitsm.runtime.arrays import ArrayLike, ValueOrFunction
 from jsmitsm.runtime.errors import did_you_mean, refuse_masked, short
@@ -53,7 +54,9 @@ class Condition:
                 return "<function>"
             return f"array{v.shape}" if np.ndim(v) and hasattr(v, "shape") else str(v)
 
-        shown = [f"{k}={short(v)}" for k, v in self.parts.items()]
+        parts = dict(self.parts)
+        shown = [f"flux of {parts['sides'][0]!r} and {parts['sides'][1]!r}"] if "sides" in parts else []
+        shown += [f"{k}={short(v)}" for k, v in parts.items() if shown == [] or k not in ("sides", "one", "two")]
         return f"{self.kind}({', '.join(shown + ([f'field={self.field}'] if self.field is not None else []))})"
 
 
@@ -71,7 +74,7 @@ def dirichlet(value: ValueOrFunction, field: int | None = None) -> Condition:
     >>> js.dirichlet(1.0)
     dirichlet(value=1.0)
     """
-    return Condition("dirichlet", _field(field), value=_value(value, "value"))
+    return Condition("dirichlet", _field(field), value=checked_value(value, "value"))
 
 
 def neumann(value: ValueOrFunction, field: int | None = None) -> Condition:
@@ -81,7 +84,7 @@ def neumann(value: ValueOrFunction, field: int | None = None) -> Condition:
     >>> js.neumann(lambda x: x[0])
     neumann(value=<function>)
     """
-    return Condition("neumann", _field(field), value=_value(value, "value"))
+    return Condition("neumann", _field(field), value=checked_value(value, "value"))
 
 
 def robin(
@@ -95,11 +98,11 @@ def robin(
     >>> js.robin(1.0, 2.0, 0.0)
     robin(a=1.0, b=2.0, value=0.0)
     """
-    a, b = _value(a, "a"), _value(b, "b")
+    a, b = checked_value(a, "a"), checked_value(b, "b")
     known = not any(callable(v) or isinstance(v, jax.core.Tracer) for v in (a, b))
     if known and np.any((np.asarray(a) == 0) & (np.asarray(b) == 0)):
         raise ValueError("robin: a and b are both zero, which states nothing of u; give one of them, or js.free()")
-    return Condition("robin", _field(field), a=a, b=b, value=_value(value, "value"))
+    return Condition("robin", _field(field), a=a, b=b, value=checked_value(value, "value"))
 
 
 def condition(residual: Callable[..., Any]) -> Condition:
@@ -147,7 +150,7 @@ def fix(indices: ArrayLike, value: ValueOrFunction, field: int | None = None) ->
         raise ValueError(f"indices: expected particle numbers, got {short(indices)}")
     if index.min() < 0 or len(np.unique(index)) != len(index):
         raise ValueError(f"indices: particles are numbered from 0 and given once each, got {index.tolist()}")
-    return Condition("fix", _field(field), indices=tuple(int(i) for i in index), value=_value(value, "value"))
+    return Condition("fix", _field(field), indices=tuple(int(i) for i in index), value=checked_value(value, "value"))
 
 
 def free() -> Condition:
@@ -166,7 +169,7 @@ def _field(field: Any) -> int | None:
     return None if field is None else int(field)
 
 
-def _value(value: Any, name: str) -> Any:
+def checked_value(value: Any, name: str) -> Any:
     """A number, array or function; anything else is refused here, where the user wrote it."""
     if callable(value) or isinstance(value, jax.core.Tracer):
         return value
@@ -193,9 +196,10 @@ class Problem:
     Parameters
     ----------
     pde : function ``(u, x)`` or ``(u, x, params)`` returning the residual at the point x (D,):
-        a scalar, or (F,) for a system. ``u`` is a local field, see :mod:`jsmitsm.equation.operators`.
+        a scalar, or (F,) for a system. ``u`` is a local field, see :mod:`jsmitsm.equation.operators`. For a cloud of
+        several regions (:func:`jsmitsm.regions`) a dict of them, one for each region by its name.
     bcs : maps each boundary group to a condition, or to a list of them where the operator's
-        order or the number of fields needs several.
+        order or the number of fields needs several; and each interface ``"a|b"`` to :func:`interface`.
     fields : number F of unknown fields.
     params : any pytree of numbers. Where it is given, every function of the problem takes it as
         its last argument, and new numbers in it never recompile.
@@ -215,12 +219,14 @@ class Problem:
 
     def __init__(
         self,
-        pde: Callable[..., Any],
+        pde: Callable[..., Any] | Mapping[str, Callable[..., Any]],
         bcs: Mapping[str, Condition | Sequence[Condition]],
         fields: int = 1,
         params: Any = None,
     ):
-        if not callable(pde):
+        if isinstance(pde, Mapping):
+            pde = per_region(pde)
+        elif not callable(pde):
             raise ValueError(f"pde: expected a function pde(u, x) returning the residual, got {type(pde).__name__}")
         if isinstance(fields, bool) or not isinstance(fields, (int, np.integer)) or fields < 1:
             raise ValueError(f"fields: expected the number of unknown fields (1, 2, ...), got {short(fields)}")
@@ -230,7 +236,7 @@ class Problem:
                 'write e.g. {"left": js.dirichlet(0.0)}'
             )
         _check_params(params)
-        self.pde = pde
+        self.pde: Any = pde
         self.fields = int(fields)
         self.params = params
         self.bcs = {name: _listed(name, value, self.fields) for name, value in bcs.items()}
@@ -245,7 +251,7 @@ class Problem:
         return Problem(**{**parts, **changes})
 
     def tree_flatten(self):
-        if isinstance(self.pde, Traced):
+        if isinstance(self.pde, (Traced, PerRegion)):
             return (self.bcs, self.params, self.pde), (None, self.fields)
         return (self.bcs, self.params), (self.pde, self.fields)
 
@@ -260,7 +266,8 @@ class Problem:
 
     def __repr__(self) -> str:
         shown = ", ".join(f"{name}: {', '.join(map(repr, value))}" for name, value in self.bcs.items())
-        return f"Problem(fields={self.fields}, {shown})"
+        of = f"regions={list(self.pde)}, " if isinstance(self.pde, PerRegion) else ""
+        return f"Problem({of}fields={self.fields}, {shown})"
 
 
 def _check_params(params: Any) -> None:

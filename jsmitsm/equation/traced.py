@@ -18,7 +18,7 @@ from jsmitsm.equation.jumps import jumps
 from jsmitsm.equation.linearizing import Record
 from jsmitsm.equation.record_form import Form, is_fixed
 from jsmitsm.runtime.compiled import fingerprint, kept
-from jsmitsm.runtime.jaxprs import EVERYTHING, NOTHING, levels
+from jsmitsm.runtime.jaxprs import EVERYTHING, NOTHING, inner_jaxprs, levels
 from jsmitsm.runtime.tracers import any_number, is_traced
 from jsmitsm.runtime.whole_program import in_one_program
 from jsmitsm.taylor.jets import evaluate, plain
@@ -29,6 +29,11 @@ from jsmitsm.taylor.series import Ring, full_series, variable
 CHUNK = 4096
 # How many programs were traced for compilation since import; tests watch it.
 COMPILATIONS = 0
+# Operations on floats whose value or slope may jump; look-ups in tables are among them.
+KINKS = frozenset(
+    "abs max min clamp sign floor ceil round rem select_n reduce_max reduce_min cummax cummin argmax argmin sort "
+    "gather dynamic_slice cond while atan2".split()
+)
 
 
 @jax.tree_util.register_pytree_node_class
@@ -109,6 +114,11 @@ class Traced:
         """The residual alone (E, N) at the points, where the slots' derivatives are ``slots`` (S, N) or zero."""
         inputs = self._inputs(points, 0, (), params, None if slots is None else slots[:, None])
         return self._compute(inputs, 0, False, True)[1][:, 0]
+
+    @cached_property
+    def kinked(self) -> bool:
+        """Whether any operation has kinks or jumps, where Taylor series end."""
+        return _kinked(self._record.jaxpr)
 
     def with_any_numbers(self) -> Traced:
         """The same with some numbers for the constants that are only traced."""
@@ -292,6 +302,10 @@ class _Inputs:
         cut = slice(low, low + size)
         slots = None if self.slots is None else self.slots[..., cut]
         return self._replace(points=self.points[cut], extras=[e[cut] for e in self.extras], slots=slots)
+
+
+def _kinked(jaxpr: Any) -> bool:
+    return any(eqn.primitive.name in KINKS or any(map(_kinked, inner_jaxprs(eqn))) for eqn in jaxpr.eqns)
 
 
 def _zeros(value: Any) -> np.ndarray:

@@ -14,8 +14,8 @@ from jsmitsm.equation.branches import branches
 from jsmitsm.equation.dependence import EXTRAS, FIELD, JUMPS, POINT, Facts
 from jsmitsm.equation.field import local_field
 from jsmitsm.equation.linearizing import Record, record
-from jsmitsm.equation.recording import recalled
 from jsmitsm.equation.traced import Traced
+from jsmitsm.runtime.recall.recording import recalled
 from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.taylor.multi_indices import Slot
 

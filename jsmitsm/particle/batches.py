@@ -69,7 +69,7 @@ class Operands(NamedTuple):
 
 def in_cloud_size(tree: Any, n: int) -> Any:
     """Arrays of all n particles padded to the size class of the cloud; what is padded is not padded again."""
-    return _widened(tree, n, cloud_size(n))
+    return widened(tree, n, cloud_size(n))
 
 
 def _pad(x: Any, n: int, size: int) -> Any:
@@ -80,7 +80,7 @@ def _pad(x: Any, n: int, size: int) -> Any:
     return xp.concatenate([x, xp.broadcast_to(x[:1], (size - n, *x.shape[1:]))])
 
 
-def _widened(tree: Any, n: int, size: int) -> Any:
+def widened(tree: Any, n: int, size: int) -> Any:
     """Every array of n particles padded to ``size``; those that are not traced stay on the host."""
     return tree if n == size else _all_padded(tree, n, size)
 
@@ -91,7 +91,7 @@ def _all_padded(tree: Any, n: int, size: int) -> Any:
 
 
 @partial(in_one_program, static=("m",))
-def _cut(tree: Any, m: int) -> Any:
+def cut(tree: Any, m: int) -> Any:
     """The first m particles. On the host where nothing is traced: an eager slice would compile for every length."""
     return jax.tree.map(lambda x: x[:m] if isinstance(x, jax.core.Tracer) else _first(np.asarray(x), m), tree)
 
@@ -99,6 +99,11 @@ def _cut(tree: Any, m: int) -> Any:
 def _first(x: np.ndarray, m: int) -> np.ndarray:
     """The first m rows; not a part of a much larger array, which would stay in memory with them."""
     return x[:m] if len(x) <= 1.25 * m else x[:m].copy()
+
+
+def effort(size: int) -> Any:
+    """The compiler's options for programs over so many particles."""
+    return on_cpu(next(some for most, some in _EFFORT if size <= most))
 
 
 def _in_size_classes(function: Any) -> Any:
@@ -119,18 +124,18 @@ def _in_size_classes(function: Any) -> Any:
         known = compiled.setdefault(form, set())
         size = at_hand(known, m, 2 * m, padded_size(m, 4)) if loose else at_hand(known, m, 1.25 * m, padded_size(m))
         points, kernel, data, whole = in_cloud_size((points, kernel, operands.data, whole), n)
-        ids, neighbours, jac, own, each = _widened(
+        ids, neighbours, jac, own, each = widened(
             (ids, neighbours, None if one_for_all else jac, operands.own, each), m, size
         )
         jac, count = operands.jac if one_for_all else jac, np.int32(m)
         given = Operands(jac, own, data, operands.shared, operands.lengths, count)
         arguments = dict(zip(names, (points, kernel, ids, neighbours, given, each, whole)))
         if inside or (kernel is not None and closes_over_traced(kernel.tree_flatten()[1])):
-            return _cut(inner(scheme, **arguments), m)
-        options = on_cpu(next(some for most, some in _EFFORT if size <= most))
+            return cut(inner(scheme, **arguments), m)
+        options = effort(size)
         most = _SMALL if operands.shared is None else _SMALL_SHARED
         small = scheme.rec.size * scheme.rec.fields <= most and one_kernel.available()
-        return _cut(called(function, {"scheme": scheme}, arguments, tuple(options.items()), small), m)
+        return cut(called(function, {"scheme": scheme}, arguments, tuple(options.items()), small), m)
 
     return padded
 

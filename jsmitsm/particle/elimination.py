@@ -22,7 +22,7 @@ import numpy as np
 
 from jsmitsm.particle.polynomials import whitening
 from jsmitsm.particle.recursion import Recursion, constraints, fit_and_tail, row_lifts, substitution
-from jsmitsm.particle.small_systems import independent, min_norm, null_space
+from jsmitsm.particle.small_systems import definite_inverse, gram_matrix, independent, null_space, product
 from jsmitsm.taylor.multi_indices import Slot, factorial, multi_indices
 
 # The ridge of a deep equation, as a part of its square.
@@ -130,13 +130,26 @@ def _deepened(scheme: Scheme, matrix: Any, basis: Any, particular: Any) -> tuple
     size = jnp.asarray(_fischer(rec)[high])
     across, deep = matrix[deeper][:, low], matrix[deeper][:, high] * size
     unit = _row_lengths(deep, jnp)[:, None]
-    wanted = jnp.concatenate([-across @ basis, -across @ particular, jnp.eye(len(deeper))], axis=1) / unit
-    spread = jnp.concatenate([deep / unit, _slack(scheme)], axis=1)
-    tail = size[:, None] * min_norm(spread.T, wanted)[: len(high)]
-    free, count = basis.shape[1], rec.fields * rec.size
-    whole = jnp.zeros((count, free), basis.dtype).at[low].set(basis).at[high].set(tail[:, :free])
-    source = jnp.zeros((count, rec.n_rows), basis.dtype).at[np.ix_(low, first)].set(particular)
-    return whole, source.at[np.ix_(high, np.concatenate([first, deeper]))].set(tail[:, free:])
+    spread = (deep / unit).T
+    # The ridge bounds the condition of the Gram matrix: its inverse needs no refinement.
+    inverse = definite_inverse(gram_matrix(spread) + _ridge(scheme) * np.eye(len(deeper)))
+    extension = product(size[:, None] * spread, inverse / unit.T)
+    follows = -product(extension, product(across, jnp.concatenate([basis, particular], axis=1)))
+    free, unused = basis.shape[1], matrix.shape[1] - len(low) - len(high)
+    whole = jnp.concatenate([basis, follows[:, :free]])
+    source = jnp.concatenate([
+        jnp.pad(particular, ((0, 0), (0, len(deeper)))), jnp.concatenate([follows[:, free:], extension], axis=1)
+    ])  # fmt: skip
+    whole, source = (_in_order(jnp.pad(x, ((0, unused), (0, 0))), low, high) for x in (whole, source))
+    return whole, _in_order(source.T, first, deeper).T
+
+
+def _in_order(matrix: Any, *parts: np.ndarray) -> Any:
+    """The rows of several parts, one after another, brought to where they belong; what is in none is zero."""
+    count = len(matrix)
+    at = np.concatenate(parts)
+    behind = np.argsort(np.concatenate([at, np.setdiff1d(np.arange(count), at)]))
+    return matrix if (np.diff(behind) == 1).all() else matrix[behind]
 
 
 def _row_lengths(matrix: Any, xp: Any) -> Any:
@@ -144,15 +157,14 @@ def _row_lengths(matrix: Any, xp: Any) -> Any:
     return xp.maximum(xp.sqrt(xp.sum(matrix**2, axis=1)), FAINT)
 
 
-def _slack(scheme: Scheme) -> np.ndarray:
-    """What every deep equation may be missed by: columns of the ridge, none where the tail is well determined.
+def _ridge(scheme: Scheme) -> float:
+    """By how much every deep equation may be missed, as a part of its square; not at all where the tail is determined.
 
     Where convection outweighs diffusion within a support, the deep equations speak of the fit's own coefficients, and
     the tail that would meet them exactly grows as the Peclet number to the power of the depth. The ridge bounds it:
     measured at cell Peclet numbers from 5 to 1000, and without effect on elliptic operators.
     """
-    n = len(fit_and_tail(scheme.rec)[3])
-    return np.zeros((n, 0)) if scheme.flat else np.sqrt(RIDGE) * np.eye(n)
+    return 0.0 if scheme.flat else RIDGE
 
 
 def _of_lower_rank(scheme: Scheme, fitted: Any, lift: Any, length: Any, white: Any) -> tuple[Any, Any, Any]:
@@ -225,7 +237,7 @@ def _deepened_on_host(
     size = _fischer(rec)[high]
     deep = matrix[np.ix_(deeper, high)] * size
     unit = _row_lengths(deep, np)
-    spread = np.concatenate([deep / unit[:, None], _slack(scheme)], axis=1)
+    spread = np.concatenate([deep / unit[:, None], np.sqrt(_ridge(scheme)) * np.eye(len(deeper))], axis=1)
     _, inverse = _refined(spread, np.eye(spread.shape[1]))
     extension, across = size[:, None] * inverse[: len(high)] / unit, matrix[np.ix_(deeper, low)]
     whole, source = np.zeros((matrix.shape[1], basis.shape[1])), np.zeros(matrix.T.shape)

@@ -171,18 +171,18 @@ def gram_inverse(a: Any, tolerance: float | None = None) -> GramInverse:
     square = jnp.diagonal(gram)
     scale = 1.0 / jnp.sqrt(jnp.where(square > 0, square, 1.0))
     gram = gram * scale[:, None] * scale
-    return GramInverse(_inverse(gram) if tolerance is None else _pivoted_inverse(gram, tolerance), scale)
+    return GramInverse(definite_inverse(gram) if tolerance is None else _pivoted_inverse(gram, tolerance), scale)
 
 
 @jax.custom_jvp
-def _inverse(gram: Any) -> Any:
+def definite_inverse(gram: Any) -> Any:
     """The inverse of a symmetric positive definite matrix (k, k)."""
     return _inverse_of_one(gram)
 
 
-@_inverse.defjvp
+@definite_inverse.defjvp
 def _inverse_jvp(primals, tangents):
-    inverse = _inverse(primals[0])
+    inverse = definite_inverse(primals[0])
     return inverse, -inverse @ (tangents[0] @ inverse)
 
 

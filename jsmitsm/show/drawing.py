@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import jax
@@ -10,6 +11,7 @@ import numpy as np
 
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.cloud.neighbours import Stencils, within
+from jsmitsm.cloud.regions.region_cloud import RegionCloud
 from jsmitsm.cloud.triangulation import cut, refined, simplices
 from jsmitsm.particle.kernels import Kernel
 from jsmitsm.runtime.tracers import is_traced
@@ -235,11 +237,11 @@ def maps(cloud: Cloud, numbers: np.ndarray, anywhere: Callable | None, at: Mappi
     if not np.isfinite(numbers).all():
         raise ValueError("sol: has values that are not finite, and did not converge; see sol.diagnose()")
 
-    pieces = [_piece(cloud, numbers, anywhere, *where) for where in _places(cloud, at)]
+    pieces = [_pieces(cloud, numbers, anywhere, *where) for where in _places(cloud, at)]
     if log:
-        low = floor(np.concatenate([z for *_, z in pieces]))
-        pieces = [(xy, triangles, np.log10(np.maximum(z, low))) for xy, triangles, z in pieces]
-    every = np.concatenate([z for *_, z in pieces])
+        low = floor(np.concatenate([z for some in pieces for *_, z in some]))
+        pieces = [[(xy, triangles, np.log10(np.maximum(z, low))) for xy, triangles, z in some] for some in pieces]
+    every = np.concatenate([z for some in pieces for *_, z in some])
     lo, hi = float(every.min()), float(every.max())
     if hi - lo <= 1e-12 * max(abs(lo), abs(hi), 1e-300):
         lo, hi = lo - 0.5, hi + 0.5
@@ -250,10 +252,11 @@ def maps(cloud: Cloud, numbers: np.ndarray, anywhere: Callable | None, at: Mappi
     many = cloud.dim == 3
     size = (3.6, 3.4) if many else page(np.asarray(cloud.points))
     drawn = panels(given, len(pieces), size)
-    for ax, (xy, triangles, z), (axis, position) in zip(drawn, pieces, _places(cloud, at)):
-        # Matplotlib leaves white what lies on the highest level.
-        z = np.clip(z, bounds[0], bounds[-1] - 1e-9 * (bounds[-1] - bounds[0]))
-        filled = ax.tricontourf(*xy.T, triangles, z, levels=bounds, cmap="cividis" if log else "viridis")
+    for ax, some, (axis, position) in zip(drawn, pieces, _places(cloud, at)):
+        for xy, triangles, z in some:
+            # Matplotlib leaves white what lies on the highest level.
+            z = np.clip(z, bounds[0], bounds[-1] - 1e-9 * (bounds[-1] - bounds[0]))
+            filled = ax.tricontourf(*xy.T, triangles, z, levels=bounds, cmap="cividis" if log else "viridis")
         ax.set_aspect("equal")
         names = [n for k, n in enumerate(_NAMES[: cloud.dim]) if k != axis]
         ax.set(xlabel=names[0], ylabel=names[1])
@@ -296,6 +299,19 @@ def _places(cloud: Cloud, at: Mapping[str, float] | None) -> list[tuple[int, flo
         if not isinstance(position, (int, float, np.number)):
             raise ValueError(f"at: expected a number for {name!r}, got {position!r}")
     return [(_NAMES.index(name), float(position)) for name, position in at.items()]
+
+
+def _pieces(cloud: Cloud, numbers: np.ndarray, anywhere: Callable | None, axis: int, position: float) -> list[tuple]:
+    """What is drawn of one domain or slice: one piece, or one for each region, so that jumps stay sharp."""
+    if not isinstance(cloud, RegionCloud):
+        return [_piece(cloud, numbers, anywhere, axis, position)]
+    out = []
+    for name, ids in cloud.regions.items():
+        part, own = cloud.region(name), None if anywhere is None else partial(anywhere, region=name)
+        reach = np.asarray(part.points)[:, axis]
+        if axis < 0 or reach.min() < position < reach.max():
+            out.append(_piece(part, numbers[ids], own, axis, position))
+    return out or [_piece(cloud.region(next(iter(cloud.regions))), numbers, anywhere, axis, position)]
 
 
 def _piece(cloud: Cloud, numbers: np.ndarray, anywhere: Callable | None, axis: int, position: float) -> tuple:

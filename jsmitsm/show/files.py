@@ -15,6 +15,7 @@ import numpy as np
 
 from jsmitsm.cloud.cloud import INTERIOR, Cloud
 from jsmitsm.cloud.mesh_facets import Mesh
+from jsmitsm.cloud.regions.region_cloud import RegionCloud
 from jsmitsm.cloud.shapes import from_polygon
 from jsmitsm.cloud.triangulation import simplices
 from jsmitsm.runtime.errors import refuse_masked
@@ -137,6 +138,8 @@ def from_csv(path: Any) -> Cloud:
     if len(lines) < 2:
         raise ValueError(f"path: {path} has no rows below its header")
     header = [name.strip() for name in lines[0][1]]
+    if "region" in header:
+        raise ValueError(f"path: {path} holds several regions, whose pairs CSV does not tell; pickle the cloud instead")
     axes = [name for name in _AXES if name in header]
     normals = [f"n{name}" for name in axes]
     if "group" not in header or "".join(axes) not in ("x", "xy", "xyz"):
@@ -204,7 +207,13 @@ def to_mesh(sol: Solution, **more: Any) -> Any:
     points = np.zeros((len(cloud), 3))
     points[:, : cloud.dim] = cloud.points
     data = {"u": np.asarray(sol.u)} | _per_particle(more, len(cloud), (1, 2))
-    return meshio.Mesh(points, [(_CELLS[cloud.dim], simplices(cloud))], point_data=data)
+    cells, tags = simplices(cloud), {}
+    if isinstance(cloud, RegionCloud):
+        number = np.zeros(len(cloud), int)
+        for k, ids in enumerate(cloud.regions.values()):
+            number[ids] = k
+        data["region"], tags["region"] = number, [number[cells[:, 0]]]
+    return meshio.Mesh(points, [(_CELLS[cloud.dim], cells)], point_data=data, cell_data=tags)
 
 
 def to_pandas(what: Cloud | Solution, **more: Any) -> Any:
@@ -281,12 +290,22 @@ def _columns(what: Cloud | Solution) -> Mapping[str, np.ndarray]:
     for name, index in cloud.groups.items():
         group[index] = name
     columns["group"] = group
+    if isinstance(cloud, RegionCloud):
+        columns["region"] = _region_names(cloud)
     if cloud.normals is not None:
         columns |= {f"n{name}": np.asarray(cloud.normals)[:, k] for k, name in enumerate(_AXES[: cloud.dim])}
     if isinstance(what, Solution):
         u = np.asarray(what.u)
         columns |= {"u": u} if u.ndim == 1 else {f"u{k}": u[:, k] for k in range(u.shape[1])}
     return columns
+
+
+def _region_names(cloud: RegionCloud) -> np.ndarray:
+    """The region (N,) of every particle."""
+    out = np.empty(len(cloud), dtype=object)
+    for name, ids in cloud.regions.items():
+        out[ids] = name
+    return out
 
 
 def _numbers(rows: list[tuple[int, dict[str, str]]], names: list[str], path: Any) -> np.ndarray:

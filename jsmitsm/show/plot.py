@@ -15,6 +15,7 @@ import numpy as np
 
 from jsmitsm.cloud.cloud import INTERIOR, Cloud
 from jsmitsm.cloud.neighbours import Stencils
+from jsmitsm.cloud.regions.region_cloud import RegionCloud
 from jsmitsm.cloud.triangulation import simplices
 from jsmitsm.particle.kernels import Kernel
 from jsmitsm.show import drawing
@@ -119,16 +120,19 @@ def solution(sol: Solution, *, field: int = 0, exact: Any = None, at: Mapping[st
     sol.refuse_stacked()
     numbers = drawing.field_of(sol.u, field)
 
-    def anywhere(points):
-        return drawing.field_of(sol(points, blend=True, outside="extrapolate"), field)
+    def anywhere(points, **side):
+        return drawing.field_of(sol(points, blend=True, outside="extrapolate", **side), field)
 
     label = "u" if np.ndim(sol.u) == 1 else f"u[{field}]"
     if sol.cloud.dim > 1:
         return drawing.maps(sol.cloud, numbers, anywhere, at, levels, colorbar, ax, label, log=False)
     ax = drawing.axes(ax, 1)
-    ends = np.asarray(sol.cloud.points)[simplices(sol.cloud), 0]
-    line = ends[:, :1] + np.linspace(0.0, 1.0, 17) * (ends[:, 1:] - ends[:, :1])
-    height = anywhere(line.reshape(-1, 1)).reshape(line.shape)
+    lines, heights = [], []
+    for part, side in _regions(sol.cloud):
+        ends = np.asarray(part.points)[simplices(part), 0]
+        lines.append(ends[:, :1] + np.linspace(0.0, 1.0, 17) * (ends[:, 1:] - ends[:, :1]))
+        heights.append(np.reshape(anywhere(lines[-1].reshape(-1, 1), **side), lines[-1].shape))
+    line, height = np.concatenate(lines), np.concatenate(heights)
     # One NaN after every piece: where the domain has a gap the curve has one.
     ax.plot(drawing.gapped(line), drawing.gapped(height), color=COLOURS[0], label=label)
     ax.plot(np.asarray(sol.cloud.points)[:, 0], numbers, "o", color=COLOURS[0], markersize=4)
@@ -138,6 +142,13 @@ def solution(sol: Solution, *, field: int = 0, exact: Any = None, at: Mapping[st
         ax.legend(frameon=False)
     drawing.labels(ax, "x", label)
     return ax
+
+
+def _regions(cloud: Cloud) -> list[tuple[Cloud, dict[str, str]]]:
+    """A cloud, or those of its regions, and what a solution needs to be told of them."""
+    if isinstance(cloud, RegionCloud):
+        return [(cloud.region(name), {"region": name}) for name in cloud.regions]
+    return [(cloud, {})]
 
 
 def values(cloud: Cloud, numbers: Any, *, log: bool = False, label: str = "", at: Mapping[str, float] | None = None,
@@ -161,9 +172,10 @@ def values(cloud: Cloud, numbers: Any, *, log: bool = False, label: str = "", at
     if cloud.dim > 1:
         return drawing.maps(cloud, numbers, None, at, levels, colorbar, ax, label, log)
     ax = drawing.axes(ax, 1)
-    order = np.argsort(np.asarray(cloud.points)[:, 0])
     shown = np.maximum(numbers, drawing.floor(numbers)) if log else numbers
-    ax.plot(np.asarray(cloud.points)[order, 0], shown[order], "o-", color=COLOURS[1], markersize=4, linewidth=1)
+    for ids in cloud.regions.values() if isinstance(cloud, RegionCloud) else (np.arange(len(cloud)),):
+        order = ids[np.argsort(np.asarray(cloud.points)[ids, 0])]
+        ax.plot(np.asarray(cloud.points)[order, 0], shown[order], "o-", color=COLOURS[1], markersize=4, linewidth=1)
     if log:
         ax.set_yscale("log")
     drawing.labels(ax, "x", label)

@@ -8,8 +8,10 @@ import numpy as np
 
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.cloud.neighbours import Stencils
+from jsmitsm.cloud.regions.region_cloud import RegionCloud
 from jsmitsm.discretization.layout import Discretization, discretize
 from jsmitsm.equation.problem import Problem
+from jsmitsm.equation.regions.per_region import PerRegion
 from jsmitsm.linear.linsolve import SOLVERS, Solver
 from jsmitsm.particle.kernels import Kernel
 from jsmitsm.runtime.errors import did_you_mean, refuse_masked, short
@@ -43,16 +45,31 @@ class SolveOptions(TypedDict, total=False):
 def discretized(
     problem: Problem, cloud: Cloud, method: str = "S", order: int = 4, kernel: Kernel | None = None,
     stencils: Stencils | None = None, basis_terms: int | None = None, formulation: str = "auto", solver: str = "auto",
-    depth: Depth = 0,
+    depth: Depth = "auto",
 ) -> Discretization:  # fmt: skip
     """Checked arguments, discretised."""
     check(problem, cloud, method, order, kernel, stencils, formulation, solver, depth=depth)
     return discretize(problem, cloud, method, order, kernel, stencils, basis_terms, depth=depth)
 
 
+def of_regions(problem: Any, cloud: Any) -> bool:
+    """Whether this is a problem with several regions on a cloud of them; ValueError where only one of the two is."""
+    several = isinstance(getattr(problem, "pde", None), PerRegion)
+    if several and not isinstance(cloud, RegionCloud):
+        raise ValueError(
+            f"cloud: the problem has the regions {list(problem.pde)}, the cloud has none; make it with js.regions"
+        )
+    if isinstance(cloud, RegionCloud) and isinstance(problem, Problem) and not several:
+        raise ValueError(
+            f"pde: the cloud has the regions {list(cloud.regions)}; give an equation for each, "
+            f"js.Problem({{{list(cloud.regions)[0]!r}: pde, ...}}, bcs)"
+        )
+    return several
+
+
 def check(
     problem, cloud, method, order, kernel, stencils, formulation="auto", solver="auto", u0=None, throw=True,
-    depth=0,
+    depth="auto",
 ) -> None:
     """Arguments of :func:`solve` that can be judged before any work."""
     for value, kind, name in ((problem, Problem, "problem"), (cloud, Cloud, "cloud")):

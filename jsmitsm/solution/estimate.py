@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import jax.numpy as jnp
@@ -11,6 +13,7 @@ from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.discretization.coefficients import Numbers, numbers
 from jsmitsm.discretization.health import LEBESGUE
 from jsmitsm.discretization.layout import Class, Discretization
+from jsmitsm.discretization.least_squares import misfit
 from jsmitsm.discretization.leave_one_out import matrix, right_side, with_held
 from jsmitsm.discretization.rows import all_rows
 from jsmitsm.particle.moments import Row
@@ -25,9 +28,25 @@ from jsmitsm.taylor.multi_indices import HIGHEST, multi_indices
 OUTLIER = 2.0
 
 
+@dataclass(frozen=True)
+class Correction:
+    """What an estimate knows besides the size of the error.
+
+    error (N, F): the estimated u_exact - u, with its sign.
+    defect (N, F): by how much every value misses its prediction by rows of a higher order, in the scale of u: what
+    each particle contributes to the error, which is the inverse of the global matrix times this. In the least-squares
+    form the misfit of its local fit; None for the methods other than S, which have neither.
+    adjoint: of weights (N, F) of the values in a number, those of the defects in it; None where there are no rows.
+    """
+
+    error: Any
+    defect: Any
+    adjoint: Callable[[np.ndarray], np.ndarray] | None
+
+
 @bar("error estimate")
-def error_estimate(fit: Fit, values: Any) -> Any:
-    """Estimated error |u - u_exact| of every particle, (N,) or (N, F).
+def correction(fit: Fit, values: Any) -> Correction:
+    """The estimated error of the values (N, F), and what it comes from.
 
     The defect of the solution in rows of order p + 2, taken through the inverse of its own
     matrix: e = A_p^-1 D (b_{p+2} - A_{p+2} u_p). D brings the rows of the two orders to one scale,
@@ -49,13 +68,20 @@ def error_estimate(fit: Fit, values: Any) -> Any:
     free = np.flatnonzero(~low.held.reshape(-1))
     ratio = _one_scale(own[1], defect[1], low)
     trust = _trust(high, *high_rows)
-    rest = (ratio * trust * defect[0]).reshape(-1)[free]
+    weighed = ratio * trust * defect[0]
     data, r, c = matrix(low, classes, rows)
-    x, _ = run.solved(data, r, c, rest, balanced=False)
-    zero = np.zeros(low.held.size)
-    error: Any = jnp.asarray(zero).at[free].set(x) if is_traced(x) else _put(zero, free, x)
-    error = abs(error).reshape(low.held.shape)
-    return error[:, 0] if low.rec.fields == 1 else error
+    x, _ = run.solved(data, r, c, weighed.reshape(-1)[free], balanced=False)
+
+    def spread(x: Any) -> Any:
+        zero = np.zeros(low.held.size)
+        every: Any = jnp.asarray(zero).at[free].set(x) if is_traced(x) else _put(zero, free, x)
+        return every.reshape(low.held.shape)
+
+    def adjoint(weights: np.ndarray) -> np.ndarray:
+        right = np.concatenate([weights.reshape(-1)[free], np.zeros(len(low.floating))])
+        return spread(run.factor_of(data, r, c).solve(right, transpose=True)[: len(free)])
+
+    return Correction(spread(x), weighed, adjoint)
 
 
 def _one_scale(mine: Any, theirs: Any, disc: Discretization) -> Any:
@@ -90,14 +116,18 @@ def _trust(disc: Discretization, classes: list[Class], rows: list[Row]) -> Any:
     return _put(trust, ids, part)[:, None]
 
 
-def _against_higher(fit: Fit, low: Discretization, values: Any) -> Any:
-    """The distance to the solution by method S of order p + 2, (N,) or (N, F)."""
+def _against_higher(fit: Fit, low: Discretization, values: Any) -> Correction:
+    """What leads to the solution by method S of order p + 2."""
     high, nums = _higher(fit, low)
     form = "lsq" if fit.recipe.formulation == "lsq" else "auto"
     run = Run(high, fit.problem, "auto", True, form == "auto", form)
     reference = with_held(high, nums, run.solved(*run.assembled(nums), balanced=False)[0])
-    error = abs(reference - values)
-    return error[:, 0] if low.rec.fields == 1 else error
+    missed = None
+    if form == "lsq" and not is_traced(reference):
+        nums = numbers(low, fit.problem, fit.taylor)
+        missed = np.zeros(low.held.shape)
+        missed[nums.ids] = misfit(low, nums, values)[:, None]
+    return Correction(reference - values, missed, None)
 
 
 def _put(array: np.ndarray, at: np.ndarray, value: Any) -> np.ndarray:

@@ -86,7 +86,10 @@ class Factorization:
         if not traced:
             run.nums, run.values = nums, np.asarray(values)
         rec = disc.rec
-        recipe = Recipe(disc.scheme.method, rec.order, disc.basis_terms, run.formulation, problem.fields, rec.depth)
+        recipe = Recipe(
+            disc.scheme.method, rec.order, disc.basis_terms, run.formulation, problem.fields, rec.depth,
+            tuple(rec.orders),
+        )  # fmt: skip
         fit = Fit(problem, disc.cloud, disc.kernel, table(disc), None, recipe)
         fine = jnp.isfinite(values).all() if traced else good
         return Solution(values, disc.cloud, recipe, fit, fine, 1, run.stats(), report=None if traced else run)
@@ -108,7 +111,7 @@ def _same(x: Any, y: Any) -> bool:
 def factorize(
     problem: Problem, cloud: Cloud, *, method: Method = "S", order: int = 4, kernel: Kernel | None = None,
     stencils: Stencils | None = None, basis_terms: int | None = None, formulation: Formulation = "auto",
-    solver: Solver = "auto", depth: Depth = 0,
+    solver: Solver = "auto", depth: Depth = "auto",
 ) -> Factorization:  # fmt: skip
     """Prepare a linear problem for many right-hand sides.
 

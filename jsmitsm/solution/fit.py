@@ -28,6 +28,7 @@ class Recipe:
     formulation: str
     fields: int
     depth: int = 0
+    operator_orders: tuple[int, ...] = ()
 
     @property
     def reach(self) -> int:

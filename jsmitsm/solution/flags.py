@@ -18,8 +18,8 @@ import numpy as np
 from jsmitsm.discretization.health import LEBESGUE
 from jsmitsm.discretization.leave_one_out import right_side
 from jsmitsm.discretization.operator_kind import cell_peclet, mean_spacing, usual_condition, wave_number
+from jsmitsm.discretization.resolution.steepness import steepness, unseen
 from jsmitsm.discretization.rows import all_rows
-from jsmitsm.discretization.steepness import steepness, unseen
 from jsmitsm.runtime.errors import some
 from jsmitsm.solution.between import between
 
@@ -62,6 +62,8 @@ CLEAR = {"roughness": 0.05, "source": 0.01, "excess": 10.0, "coefficient": 0.1}
 CLEAR_WAVE = 0.1  # of PHASE
 # The operator's coefficients at a neighbour differ from their Taylor polynomials by this part of the largest term.
 COEFFICIENT = 0.3
+# By so much more its series has nothing to do with a coefficient, and all orders agree on another problem.
+DIVERGENT = 100.0
 # The estimate passes through the same inverse: of a condition so many times the usual one it can tell nothing.
 BLIND = 1e6
 # Beyond so many particles an error estimate would cost more than a look at the flags may.
@@ -88,7 +90,8 @@ def flags(run: Any, values: Any, nums: Any, estimated: Callable[[], float]) -> t
     singular = found.get("excess", 0.0) > SINGULAR[run.formulation]
     # Near a resonance the last digits of the source decide, and the estimate passes through the same inverse.
     resonant = singular and found.get("source", 0.0) > OVERWHELMING
-    if certain or resonant or found.get("misfit", 0.0) > most or found.get("excess", 0.0) > BLIND:
+    blind = found.get("excess", 0.0) > BLIND or found.get("coefficient", 0.0) > DIVERGENT
+    if certain or resonant or blind or found.get("misfit", 0.0) > most:
         return doubts + certain, found
     if len(run.disc.cloud) > MANY or _cleared(run, found, doubts):
         return doubts + certain, found
@@ -324,3 +327,8 @@ def _far_away(run: Any, values: np.ndarray, nums: Any, out: list[str], found: di
             f"Coordinates up to {far:.0e} in {dtype} are known to {found['rounded']:.1g} of the spacing only: move the "
             "cloud to the origin, or use float64."
         )
+
+
+# The tests that ask the whole system, and those that ask one region of several alone.
+OF_THE_WHOLE = (_round_off, _condition, _far_away)
+OF_A_REGION = (_jumps, _waves, _roughness, _coefficients, _peclet)

@@ -13,11 +13,12 @@ import numpy as np
 
 from jsmitsm.discretization import health
 from jsmitsm.discretization.coefficients import Numbers, numbers
+from jsmitsm.discretization.held_particles import with_held_expansions
 from jsmitsm.discretization.layout import Class, Discretization, discretize
 from jsmitsm.discretization.least_squares import least_squares, misfit
 from jsmitsm.discretization.leave_one_out import matrix, right_side, with_held
 from jsmitsm.discretization.operator_kind import prefers_least_squares, usual_condition
-from jsmitsm.discretization.rows import all_rows
+from jsmitsm.discretization.rows import all_coefficients, all_rows
 from jsmitsm.equation.problem import Problem
 from jsmitsm.linear import linsolve
 from jsmitsm.particle.moments import Row
@@ -59,6 +60,18 @@ class Run:
         self.nums: Numbers | None = None
         self.values: np.ndarray | None = None
 
+    def numbers(self, taylor: Any = None) -> Any:
+        """The numbers of the problem, linearised at the expansions ``taylor`` (N, F, K) where it is nonlinear."""
+        return numbers(self.disc, self.problem, taylor)
+
+    def expanded(self, nums: Any, values: Any) -> Any:
+        """The expansions (N, F, K) that belong to values (N, F), those of held particles too."""
+        return with_held_expansions(self.disc, all_coefficients(self.disc, nums, values))
+
+    def operators(self) -> list[tuple[Discretization, Any, np.ndarray]]:
+        """The discretisation of each equation, its numbers, and the particles (of all) where it holds."""
+        return [(self.disc, self.nums, np.arange(len(self.disc.cloud)))]
+
     def local_rows(self, nums: Numbers) -> tuple[list[Class], list[Row]]:
         """The rows of all classes, weak stencils repaired the first time."""
         disc = self.disc
@@ -73,10 +86,16 @@ class Run:
             self.health = health.examine(classes, rows)
             if before is not None:  # Newton's later steps keep the stencils of the first
                 self.health.repaired = before.repaired
+        self.judge(nums, rows)
+        return classes, rows
+
+    def judge(self, nums: Any, rows: list[Row]) -> None:
+        """Tell of repairs and weak stencils; fail where rows are not determined."""
         if self.repair:
             self._tell_repairs()
+        assert self.health is not None
         bad = self.health.undetermined
-        if len(bad) and not np.isfinite(np.asarray(nums.jac)).all():
+        if len(bad) and not self._finite(nums):
             self.fail(
                 f"the equation or its derivative by u is not finite at {len(bad)} particle(s), first {some(bad)}: "
                 "start nearer to the solution (u0), inside the range for which the pde is defined",
@@ -91,7 +110,9 @@ class Run:
                 + "widen the support (h, d or stencils), lower the order, or move the particles",
                 bad,
             )
-        return classes, rows
+
+    def _finite(self, nums: Any) -> bool:
+        return bool(np.isfinite(np.asarray(nums.jac)).all())
 
     def _tell_repairs(self) -> None:
         found = self.health
@@ -123,7 +144,7 @@ class Run:
         self.__dict__.pop("factor", None)
         self.__dict__.pop("misfit", None)
 
-    def step(self, nums: Numbers, altered: Callable[..., Any] | None = None) -> tuple[Any, Any]:
+    def step(self, nums: Any, altered: Callable[..., Any] | None = None) -> tuple[Any, Any]:
         """Assemble and solve one linear system: values (N, F), and whether it went well.
 
         altered: a function of the system's entries, their rows and columns and the right-hand side that returns others.
@@ -170,12 +191,7 @@ class Run:
         start = clock()
         self._forget()
         if nums.degenerate is not None and len(nums.degenerate.empty):
-            at = nums.degenerate.empty
-            self.fail(
-                f"the equation says nothing at {len(at)} particle(s), first {some(at)}: all its coefficients vanish "
-                "there and around; hold their values (js.fix), or leave that part out of the cloud",
-                at,
-            )
+            self._fail_empty(nums.degenerate.empty)
         if disc.cut_off:
             self.messages.append(
                 f"The supports of at least {len(disc.cut_off)} particle(s), first {some(disc.cut_off)}, reach outside "
@@ -194,6 +210,13 @@ class Run:
         self.seconds["local"] += local - start
         self.seconds["assembly"] += clock() - local
         return made
+
+    def _fail_empty(self, at: np.ndarray) -> None:
+        self.fail(
+            f"the equation says nothing at {len(at)} particle(s), first {some(at)}: all its coefficients vanish "
+            "there and around; hold their values (js.fix), or leave that part out of the cloud",
+            at,
+        )
 
     def solved(self, data: Any, r: Any, c: Any, b: Any, balanced: bool = True) -> tuple[Any, bool]:
         """Solve the global system; floating fields get a zero mean by a Lagrange multiplier.

@@ -14,7 +14,7 @@ from jsmitsm.cloud.quadrature import quadrature
 from jsmitsm.runtime.arrays import Array, ArrayLike, ValueOrFunction
 from jsmitsm.runtime.errors import SolveError
 from jsmitsm.runtime.tracers import frozen, is_traced, owned
-from jsmitsm.solution.estimate import error_estimate
+from jsmitsm.solution.estimate import Correction, correction
 from jsmitsm.solution.evaluation import checked_points, evaluated, in_domain, nearest_particles
 from jsmitsm.solution.fit import Recipe
 from jsmitsm.solution.flags import share
@@ -90,6 +90,11 @@ class Solution:
     def depth(self) -> int:
         """Degrees by which the local Taylor polynomials exceed the order."""
         return self._recipe.depth
+
+    @property
+    def operator_orders(self) -> tuple[int, ...]:
+        """Of every equation the order of its highest derivatives."""
+        return self._recipe.operator_orders
 
     @property
     def u(self) -> Array:
@@ -213,11 +218,27 @@ class Solution:
             return self._error
         if self._fit is None:
             raise ValueError("error_estimate: this solution was pickled without its problem; ask before pickling")
-        error = error_estimate(self._fit, self._values)
+        own = getattr(self._fit, "error_estimate", None)  # one of several regions brings its own
+        return self._kept(own(self._values)) if own else self._size(correction(self._fit, self._values))
+
+    def _size(self, found: Correction) -> Array:
+        """The size of an estimated error, kept for the next who asks."""
+        return self._kept(abs(found.error)[..., 0] if self._recipe.fields == 1 else abs(found.error))
+
+    def _kept(self, error: Array) -> Array:
         if not is_traced(error, self._values):
             self._error = frozen(error)
             self._share = share(np.reshape(error, np.shape(self._values)), np.asarray(self._values))
         return error
+
+    def correction(self) -> Correction:
+        """What the error estimate is made of, for those who refine by it: signed errors, defects and their weights."""
+        self.refuse_stacked()
+        if hasattr(self._fit, "error_estimate"):
+            raise ValueError("correction: several regions have an error estimate, but no defects to refine by")
+        found = correction(self._fit, self._values)
+        self._size(found)
+        return found
 
     def _estimated(self) -> float:
         """The estimated error over the solution, infinite where there is none."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from typing import Any
+from typing import Any, Literal
 
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.cloud.neighbours import Stencils
@@ -15,9 +15,11 @@ from jsmitsm.particle.kernels import Kernel
 from jsmitsm.runtime.arrays import ValueOrFunction
 from jsmitsm.runtime.progress import bar
 from jsmitsm.runtime.tracers import is_traced
-from jsmitsm.solution.arguments import Depth, Formulation, Method, check
+from jsmitsm.solution.arguments import Depth, Formulation, Method, check, of_regions
 from jsmitsm.solution.fit import Fit, Recipe
 from jsmitsm.solution.nonlinear.newton import newton
+from jsmitsm.solution.order_choice import check_tolerance, of_tolerance
+from jsmitsm.solution.regions.solve import solve_regions
 from jsmitsm.solution.run import Run
 from jsmitsm.solution.solution import Solution
 
@@ -28,8 +30,9 @@ def solve(
     cloud: Cloud,
     *,
     method: Method = "S",
-    order: int = 4,
-    depth: Depth = 0,
+    order: int | Literal["auto"] = 4,
+    tol: float | None = None,
+    depth: Depth = "auto",
     kernel: Kernel | None = None,
     stencils: Stencils | None = None,
     basis_terms: int | None = None,
@@ -44,7 +47,10 @@ def solve(
     ----------
     method : "I", "II", "III" (SMITSM, Karamanli 2015), "SSPH", or "S", the recursion with
         symmetric moment rows.
-    order : total degree of the fit.
+    order : total degree of the fit. "auto": the lowest even one from 4 whose estimated error is within ``tol``; where
+        none is, the best one, with a flag that says so.
+    tol : with ``order="auto"``, the wanted error relative to the largest \\|u\\|. The cloud stays as it is:
+        :func:`jsmitsm.adapt` makes one that the tolerance needs.
     depth : degrees by which the recursion goes beyond the order: the local polynomials have degree
         order + depth, with no more free coefficients. 0 is the paper's. "auto" is, for method S, 4 in 1D and 2D (2 at
         order 2), in 3D 2, or 4 where the operator is constant and of one order; for I, II and III 0. SSPH has no
@@ -80,20 +86,30 @@ def solve(
     >>> bool(abs(sol.u - (cloud.points[:, 0] ** 5 / 20 + 2 * cloud.points[:, 0] + 1)).max() < 1e-12)
     True
     """
-    run = prepared(
-        problem, cloud, method=method, order=order, kernel=kernel, stencils=stencils, basis_terms=basis_terms,
-        formulation=formulation, solver=solver, u0=u0, throw=throw, depth=depth,
-    )  # fmt: skip
-    if run.disc.linear:
-        values, good = run.step(numbers(run.disc, problem))
-        return finished(run, values, None, good, 1)
-    return finished(run, *newton(run, u0))
+    check_tolerance(order, tol)
+    if of_regions(problem, cloud):
+        return solve_regions(
+            problem, cloud, method=method, order=order, kernel=kernel, stencils=stencils, basis_terms=basis_terms,
+            formulation=formulation, solver=solver, u0=u0, throw=throw, depth=depth,
+        )  # fmt: skip
+
+    def solved(order: Any) -> tuple[Solution, Run]:
+        run = prepared(
+            problem, cloud, method=method, order=order, kernel=kernel, stencils=stencils, basis_terms=basis_terms,
+            formulation=formulation, solver=solver, u0=u0, throw=throw, depth=depth,
+        )  # fmt: skip
+        if run.disc.linear:
+            values, good = run.step(numbers(run.disc, problem))
+            return finished(run, values, None, good, 1), run
+        return finished(run, *newton(run, u0)), run
+
+    return of_tolerance(solved, tol) if order == "auto" and tol is not None else solved(order)[0]
 
 
 def prepared(
     problem: Problem, cloud: Cloud, *, method: str = "S", order: int = 4, kernel: Kernel | None = None,
     stencils: Stencils | None = None, basis_terms: int | None = None, formulation: str = "auto", solver: str = "auto",
-    u0: Any = None, throw: bool = True, depth: Depth = 0,
+    u0: Any = None, throw: bool = True, depth: Depth = "auto",
 ) -> Run:  # fmt: skip
     """Checked arguments of :func:`solve`, discretised."""
     start = time.perf_counter()
@@ -113,8 +129,8 @@ def finished(run: Run, values: Any, taylor: Any, good: Any, iterations: Any) -> 
     run.seconds["total"] = time.perf_counter() - run.began
     recipe = Recipe(
         scheme.method, disc.rec.order, disc.basis_terms, run.formulation, disc.rec.fields,
-        disc.rec.depth,
-    )
+        disc.rec.depth, tuple(disc.rec.orders),
+    )  # fmt: skip
     fit = Fit(run.problem, disc.cloud, disc.kernel, table(disc), taylor, recipe)
     report = None if is_traced(values) else run
     return Solution(values, disc.cloud, recipe, fit, good, iterations, run.stats(), report=report)

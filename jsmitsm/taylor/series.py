@@ -98,10 +98,14 @@ def mul(ring: Ring, x: Array, y: Array) -> Array:
     degree = min(left + right, ring.degree)
     if not on_host(x, y):
         return pairing(x, y, product(ring.dim, left, right, 0, degree))
-    shape = np.broadcast_shapes(x.shape[1:], y.shape[1:])
-    out = np.zeros((count(ring.dim, degree), *shape), np.result_type(x, y))
     # What is not finite is refused by name, with its particles, where the numbers are used.
     with np.errstate(over="ignore", invalid="ignore"):
+        if degree == 1:
+            out = x[:1] * y
+            out[1:] += x[1:] * y[:1]
+            return out
+        shape = np.broadcast_shapes(x.shape[1:], y.shape[1:])
+        out = np.zeros((count(ring.dim, degree), *shape), np.result_type(x, y))
         for a, (n, places) in enumerate(product_rows(ring.dim, left, right, degree)):
             if n and np.any(x[a]):
                 out[places] += x[a] * y[:n]
@@ -201,6 +205,8 @@ def power(ring: Ring, x: Array, r: Array, start: Array) -> Array:
     """x**r for an exponent independent of x, from x E(w) = r w E(x); ``start`` is x0**r."""
     x, r, start = align(x, r, start)
     x0 = x[:1]
+    if ring.degree == 1 and on_host(x, r, start):
+        return np.concatenate([start, r * (x[1:] * start) / x0])
 
     def step(k: int, w: list[Array]) -> list[Array]:
         right = r * product_block(ring, x, w[0], k, weighted=True)

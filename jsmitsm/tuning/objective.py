@@ -123,7 +123,7 @@ class Objective:
             try:
                 disc = discretize(
                     self.problem, self.cloud, o["method"], o["order"], wide, self.given, o.get("basis_terms"),
-                    depth=o.get("depth", 0),
+                    depth=o.get("depth", "auto"),
                 )
                 break
             except ValueError as error:

@@ -172,7 +172,7 @@ def _check_input(problem, cloud, kernel, objective, optimizer, steps, options) -
                              + did_you_mean(name, [*OPTIONS, "objective", "optimizer", "steps"]))  # fmt: skip
     o = {"formulation": "auto", "solver": "auto", "stencils": None, **options}
     check(problem, cloud, o["method"], o["order"], kernel, o["stencils"], o["formulation"], o["solver"],
-          depth=o.get("depth", 0))
+          depth=o.get("depth", "auto"))
     if is_traced(kernel, cloud, problem.params):
         raise ValueError("kernel, cloud, problem: traced by a JAX transform; js.tune runs on the host, call it outside")
     if objective != "estimate" and not callable(objective):

@@ -13,9 +13,9 @@ import pytest
 
 import jsmitsm as js
 from jsmitsm.equation import tracing
-from jsmitsm.equation.recording import Unknown, identity
 from jsmitsm.equation.tracing import trace
 from jsmitsm.runtime import compiled
+from jsmitsm.runtime.recall.recording import Unknown, identity
 
 FACTOR = 2.0
 

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm.discretization.coefficients import slot_series
-from jsmitsm.discretization.layout import refuse_jumps
+from jsmitsm.discretization.layout import discretize, refuse_jumps
 from jsmitsm.equation.branches import FIELD
 from jsmitsm.runtime.errors import SolveError, some
 from jsmitsm.runtime.progress import bar
@@ -67,12 +67,13 @@ def newton(run: Run, u0: Any) -> tuple[Any, Any, Any, Any]:
 
 def _refuse_jumps(run: Run, values: Any, taylor: Any) -> None:
     """Refuse jumps that the operator differentiates where they depend on u, as it has come out."""
-    disc, found = run.disc, run.disc.traced.branches
-    if found is None or not found.depends & FIELD:
-        return
-    slots, place = slot_series(disc.rec, found.slots, taylor, 0)[:, 0], (0,) * disc.rec.dim
-    given = [values[:, f] if b == place else slots[k] for k, (f, b) in enumerate(found.slots)]
-    refuse_jumps(disc, run.problem, (jnp if is_traced(given) else np).stack(given))
+    for disc, _, ids in run.operators():
+        found = disc.traced.branches
+        if found is None or not found.depends & FIELD:
+            continue
+        slots, place = slot_series(disc.rec, found.slots, taylor[ids], 0)[:, 0], (0,) * disc.rec.dim
+        given = [values[ids, f] if b == place else slots[k] for k, (f, b) in enumerate(found.slots)]
+        refuse_jumps(disc, disc.problem, (jnp if is_traced(given) else np).stack(given))
 
 
 def _repeats(rate: float) -> int:
@@ -115,21 +116,25 @@ class Found(NamedTuple):
 
 def _refuse_degenerate(run: Run) -> None:
     """An equation of which nothing is left at a particle leaves its fit free there, and the system regular."""
-    if run.nums is None or is_traced(run.nums.jac):
-        return
-    left = np.abs(np.asarray(run.nums.jac)[:, :, 0]).max(axis=1).min(axis=0)
-    if (left == 0).any():
-        at = np.broadcast_to(run.nums.ids, np.broadcast_shapes(run.nums.ids.shape, left.shape))[left == 0]
-        run.fail(f"{NOTHING} at {len(at)} particle(s), first {some(at)}", at)
+    for _, nums, ids in run.operators():
+        if nums is None or is_traced(nums.jac):
+            return
+        left = np.abs(np.asarray(nums.jac)[:, :, 0]).max(axis=1).min(axis=0)
+        if (left == 0).any():
+            at = ids[np.broadcast_to(nums.ids, np.broadcast_shapes(nums.ids.shape, left.shape))[left == 0]]
+            run.fail(f"{NOTHING} at {len(at)} particle(s), first {some(at)}", at)
 
 
 def _searched(record: Record, begin: Iterate, first: Iterate) -> Found:
-    """Damped steps; where they lead nowhere, pseudo-time steps, and in the end full ones."""
+    """Damped steps; where they lead nowhere, those without depth, in pseudo-time, and in the end full ones."""
     if not np.isfinite(first.values).all():
         return Found(first, np.inf, False, np.zeros(0, int))
     best = _damped(record, begin, first)
     ways = ["damped steps"]
-    for name, search in (("pseudo-time steps", _in_pseudo_time), ("full steps", _wandering)):
+    further = [("pseudo-time steps", _in_pseudo_time), ("full steps", _wandering)]
+    if record.run.disc.rec.depth:
+        further.insert(0, ("steps without depth", _without_depth))
+    for name, search in further:
         if best.good:
             break
         ways.append(name)
@@ -199,6 +204,27 @@ def _rounded(run: Run, length: float, after: float, size: float) -> bool:
     if length > ROUND_OFF * size or after > 100.0 * length or run.factor is None:
         return False
     return bool(length <= ROUNDING * run.factor.condition() * size)
+
+
+def _without_depth(record: Record, begin: Iterate, first: Iterate) -> Iterate | None:
+    """The solution where the recursion ends with the fit: far from it deep expansions mislead."""
+    run, disc = record.run, record.run.disc
+    given = disc.stencils if disc.given_stencils else None
+    low = discretize(
+        run.problem, disc.cloud, disc.scheme.method, disc.rec.order, disc.kernel, given, disc.basis_terms,
+        sources=False, depth=0,
+    )  # fmt: skip
+    other = Record(Run(low, run.problem, run.solver, True, run.repair, run.formulation), record.shown)
+    here = begin._replace(taylor=begin.taylor[:, :, : low.rec.size])
+    try:
+        found = _searched(other, here, advance(other.run, here.taylor).numbers())
+    except SolveError:
+        return None
+    finally:
+        record.steps, record.solves = record.steps + other.steps, record.solves + other.solves
+    record.changes += other.changes
+    more = disc.rec.size - low.rec.size
+    return found.at._replace(taylor=np.pad(found.at.taylor, ((0, 0), (0, 0), (0, more))))
 
 
 def _in_pseudo_time(record: Record, begin: Iterate, first: Iterate) -> Iterate | None:

@@ -19,10 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jsmitsm.discretization.coefficients import numbers
-from jsmitsm.discretization.held_particles import with_held_expansions
 from jsmitsm.discretization.layout import Discretization
-from jsmitsm.discretization.rows import all_coefficients
 from jsmitsm.runtime.errors import SolveError
 from jsmitsm.runtime.tracers import concrete
 from jsmitsm.solution.nonlinear.start import lengths
@@ -105,9 +102,9 @@ class Frozen:
 
 def advance(run: Run, taylor: Any, altered: Callable[..., Any] | None = None) -> Iterate:
     """One full step from the expansions; ``altered`` may change the linear system (see :meth:`Run.step`)."""
-    nums = numbers(run.disc, run.problem, taylor)
+    nums = run.numbers(taylor)
     values, _ = run.step(nums, altered)
-    return Iterate(values, with_held_expansions(run.disc, all_coefficients(run.disc, nums, values)))
+    return Iterate(values, run.expanded(nums, values))
 
 
 @dataclass

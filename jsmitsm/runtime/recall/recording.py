@@ -3,7 +3,7 @@
 JAX remembers functions by identity, so that a lambda written anew is recorded anew, and one that
 reads a changed global is not. Here a function is remembered by its code and by the values that the
 code can reach. Numbers, arrays, containers and functions made of such are followed; what JAX, NumPy
-and Python bring along is taken as it is where it is proven to have no state (:mod:`jsmitsm.equation.stateless`).
+and Python bring along is taken as it is where it is proven to have no state (:mod:`jsmitsm.runtime.recall.stateless`).
 Everything else (an object with attributes, a generator, a file, what is looked up by a name made at run
 time) is :class:`Unknown`, and such a function is recorded at every use: that takes milliseconds.
 """
@@ -21,8 +21,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from jsmitsm.equation.lookups import Lookups, lookups
-from jsmitsm.equation.stateless import attribute, made_by_library, of_library, stateless
+from jsmitsm.runtime.recall.lookups import Lookups, lookups
+from jsmitsm.runtime.recall.stateless import attribute, made_by_library, of_library, stateless
 
 # Recorded functions kept, and the largest array compared by its contents.
 _KEPT = 256

@@ -1,0 +1,97 @@
+"""Tolerances in, answers out: ``python -m benchmarks.adaptation [name ...] [--tol 1e-3 1e-6] [--most 300000]``.
+
+Every problem of :mod:`benchmarks.nist` from the default start, nothing told of its solution. Prints a table as it goes
+and writes ``benchmarks/data/adaptation.json``. With NGSolve installed (``pip install ngsolve``) the scalar problems on
+polygons are solved beside it by h-adaptive finite elements of order 4 with a flux-recovery estimator; else a line says
+that they were left out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+import jsmitsm as js
+from benchmarks.machine import describe
+from benchmarks.nist import CASES, LEFT_OUT, Case
+
+DATA = Path(__file__).parent / "data" / "adaptation.json"
+
+
+def true_error(case: Case, found: js.Adapted) -> float:
+    """The largest error at the particles over the largest value, as the tolerance measures it."""
+    exact = np.asarray(jax.vmap(case.exact)(np.asarray(found.cloud.points)))
+    return float(np.abs(np.asarray(found.solution.u) - exact).max() / np.abs(exact).max())
+
+
+def measure(name: str, tol: float, most: int) -> dict[str, Any]:
+    case = CASES[name]()
+    start = time.perf_counter()
+    row: dict[str, Any] = {"case": name, "name": case.name, "tol": tol}
+    try:
+        found = js.adapt(case.problem, case.make, tol, max_particles=most, progress=False)
+    except (ValueError, js.SolveError, MemoryError) as error:
+        return row | {"reached": False, "failed": f"{type(error).__name__}: {error}"[:200]}
+    seconds = time.perf_counter() - start
+    counts = found.history["particles"]
+    return row | {
+        "reached": found.reached,
+        "true": true_error(case, found),
+        "estimate": found.error,
+        "particles": len(found.cloud),
+        "order": found.solution.order,
+        "rounds": len(counts),
+        "seconds": seconds,
+        "whole": float(counts.sum() / counts[-1]),
+        "said": found.messages + found.flags,
+    }
+
+
+def shown(row: dict[str, Any]) -> str:
+    if "failed" in row:
+        return f"| {row['name']} | {row['tol']:.0e} | failed: {row['failed']} | | | | | | |"
+    ratio = row["estimate"] / row["true"] if row["true"] else float("nan")
+    return (
+        f"| {row['name']} | {row['tol']:.0e} | {'yes' if row['reached'] else 'no'} | {row['true']:.1e} | "
+        f"{ratio:.2f} | {row['particles']} | {row['order']} | {row['rounds']} | {row['seconds']:.1f} |"
+    )
+
+
+def check(rows: list[dict[str, Any]]) -> list[str]:
+    """What would be dishonest: "reached" where it is not."""
+    return [
+        f"{row['name']} at {row['tol']:.0e}: reached, but the true error is {row['true']:.1e}"
+        for row in rows
+        if row.get("reached") and row["true"] > 3 * row["tol"]
+    ]
+
+
+def main() -> None:
+    jax.config.update("jax_enable_x64", True)
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("names", nargs="*", choices=[*CASES, []], default=[])
+    parser.add_argument("--tol", nargs="+", type=float, default=[1e-3, 1e-6])
+    parser.add_argument("--most", type=int, default=300_000)
+    parser.add_argument("--out", type=Path, default=DATA)
+    given = parser.parse_args()
+    print(f"Left out, for they need several materials: {', '.join(LEFT_OUT)}.")
+    print("| problem | tolerance | reached | true error | estimate / true | particles | order | rounds | seconds |")
+    print("| --- | --- | --- | --- | --- | --- | --- | --- | --- |", flush=True)
+    rows = []
+    for name in given.names or CASES:
+        for tol in given.tol:
+            rows.append(measure(name, tol, given.most))
+            print(shown(rows[-1]), flush=True)
+            given.out.write_text(json.dumps({"machine": describe(), "rows": rows}, indent=1) + "\n")
+    for line in check(rows):
+        print(f"WRONG: {line}")
+
+
+if __name__ == "__main__":
+    main()

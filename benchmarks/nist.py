@@ -1,0 +1,221 @@
+"""Problems for adaptive methods: W. F. Mitchell, A collection of 2D elliptic problems for testing adaptive grid
+refinement algorithms, Appl. Math. Comput. 220 (2013), with their published parameters, and some in 1D and 3D.
+
+The battery (Kellogg's problem with interfaces) and the intersecting interfaces need several materials and are left
+out. A slit of 2 pi is opened by a hair.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jsmitsm as js
+
+UNIT = ((0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0))
+SQUARE = ((-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0))
+# Half the angle that is cut out of a plane with a slit.
+HAIR = 0.005
+
+
+class Case(NamedTuple):
+    """A problem with its domain and the exact solution."""
+
+    name: str
+    problem: js.Problem
+    make: Callable[[Any], js.Cloud]
+    exact: Callable[[Any], Any]
+    polygon: tuple[tuple[float, float], ...] | None = None
+
+
+def _polygon(name: str, polygon: Any, exact: Any, pde: Any, fields: int = 1) -> Case:
+    problem = js.Problem(pde, {"boundary": js.dirichlet(exact)}, fields=fields)
+    return Case(name, problem, lambda spacing: js.from_polygon(polygon, spacing), exact, tuple(map(tuple, polygon)))
+
+
+def _poisson(name: str, polygon: Any, exact: Any) -> Case:
+    source = lambda x: jnp.trace(jax.hessian(exact)(x))
+    return _polygon(name, polygon, exact, lambda u, x: js.laplacian(u)(x) - source(x))
+
+
+def analytic(p: int = 10) -> Case:
+    return _poisson(
+        "analytic", UNIT, lambda x: 2.0 ** (4 * p) * (x[0] * (1 - x[0])) ** p * (x[1] * (1 - x[1])) ** p
+    )
+
+
+def sector(angle: float) -> list[tuple[float, float]]:
+    """The square without what lies beyond the angle, seen from its middle."""
+    corners = [(1, 1), (-1, 1), (-1, -1), (1, -1)]
+    kept = [c for c in corners if np.arctan2(c[1], c[0]) % (2 * np.pi) < angle - 1e-9]
+    end = np.array([np.cos(angle), np.sin(angle)])
+    end = end / np.abs(end).max()
+    if kept and np.allclose(end, kept[-1]):
+        kept = kept[:-1]
+    return [(0.0, 0.0), (1.0, 0.0), *kept, tuple(end)]
+
+
+def polar(x: Any, cut: float) -> tuple[Any, Any]:
+    """Radius and angle from 0; the jump of the angle lies at ``cut``, outside of the domain."""
+    square = x[0] ** 2 + x[1] ** 2
+    middle = square == 0
+    safe = jnp.where(middle, 1.0, square)
+    angle = jnp.arctan2(jnp.where(middle, 0.0, x[1]), jnp.where(middle, 1.0, x[0]))
+    angle = jnp.where(angle < cut - 2 * np.pi, angle + 2 * np.pi, angle)
+    return jnp.where(middle, 0.0, jnp.sqrt(safe)), angle
+
+
+def reentrant(angle: float, name: str) -> Case:
+    """r^a sin(a t) at a corner of this angle, a = pi / angle."""
+    angle = min(angle, 2 * np.pi - 2 * HAIR)
+    a, cut = np.pi / angle, angle / 2 + np.pi
+
+    def exact(x):
+        r, t = polar(x, cut)
+        return jnp.where(r > 0, jnp.where(r > 0, r, 1.0) ** a * jnp.sin(a * t), 0.0)
+
+    return _polygon(f"reentrant corner, {name}", sector(angle), exact, lambda u, x: js.laplacian(u)(x))
+
+
+def elastic(mode: int) -> Case:
+    """A crack: two equations with a mixed derivative, E = 1, nu = 0.3, plane strain."""
+    nu, modulus = 0.3, 1.0
+    exponent, q = {1: (0.5444837367825, 0.5430755788367), 2: (0.9085291898461, -0.2189232362488)}[mode]
+    kappa, shear, angle = 3.0 - 4.0 * nu, modulus / (2 * (1 + nu)), 2 * np.pi - 2 * HAIR
+    cut = angle / 2 + np.pi
+
+    def exact(x):
+        r, t = polar(x, cut)
+        s = jnp.where(r > 0, jnp.where(r > 0, r, 1.0) ** exponent, 0.0) / (2 * shear)
+        a, b = exponent * t, (exponent - 2) * t
+        if mode == 1:
+            one = (kappa - q * (exponent + 1)) * jnp.cos(a) - exponent * jnp.cos(b)
+            two = (kappa + q * (exponent + 1)) * jnp.sin(a) + exponent * jnp.sin(b)
+        else:
+            one = (kappa - q * (exponent + 1)) * jnp.sin(a) - exponent * jnp.sin(b)
+            two = -(kappa + q * (exponent + 1)) * jnp.cos(a) - exponent * jnp.cos(b)
+        return s * jnp.stack([one, two])
+
+    def pde(u, x):
+        dilatation = 1.0 / (1.0 - 2.0 * nu)
+        mixed = js.partial(u[0], (1, 1))(x), js.partial(u[1], (1, 1))(x)
+        return (
+            js.laplacian(u[0])(x) + dilatation * (js.partial(u[0], (2, 0))(x) + mixed[1]),
+            js.laplacian(u[1])(x) + dilatation * (mixed[0] + js.partial(u[1], (0, 2))(x)),
+        )
+
+    return _polygon(f"elasticity, mode {mode}", sector(angle), exact, pde, fields=2)
+
+
+def peak(a: float, centre: tuple[float, float]) -> Case:
+    return _poisson(
+        f"peak, {a:.0e}", UNIT, lambda x: jnp.exp(-a * ((x[0] - centre[0]) ** 2 + (x[1] - centre[1]) ** 2))
+    )
+
+
+def layer(eps: float) -> Case:
+    def exact(x):
+        decay = (1 - jnp.exp(-(1 - x[0]) / eps)) * (1 - jnp.exp(-(1 - x[1]) / eps))
+        return decay * jnp.cos(np.pi * (x[0] + x[1]))
+
+    def pde(u, x):
+        known = jax.grad(exact)(x)
+        source = -eps * jnp.trace(jax.hessian(exact)(x)) + 2 * known[0] + known[1]
+        slope = js.grad(u)(x)
+        return -eps * js.laplacian(u)(x) + 2 * slope[0] + slope[1] - source
+
+    return _polygon(f"boundary layer, {eps:.0e}", SQUARE, exact, pde)
+
+
+def line(a: float = 0.6) -> Case:
+    """x^a on the unit square, singular along a side."""
+    exact = lambda x: jnp.where(x[0] > 0, jnp.where(x[0] > 0, x[0], 1.0) ** a, 0.0)
+    return _polygon(
+        "boundary line singularity", UNIT, exact, lambda u, x: js.laplacian(u)(x) - a * (a - 1) * x[0] ** (a - 2)
+    )
+
+
+def oscillatory(count: int) -> Case:
+    a = 1.0 / (count * np.pi)
+
+    def exact(x):
+        return jnp.sin(1.0 / (a + jnp.sqrt(x[0] ** 2 + x[1] ** 2)))
+
+    def known(x):  # -laplacian(exact) - exact / (a + r)^4, in which the largest terms cancel
+        r = jnp.sqrt(x[0] ** 2 + x[1] ** 2)
+        s = a + r
+        return jnp.cos(1.0 / s) * (1.0 / (r * s**2) - 2.0 / s**3)
+
+    def pde(u, x):
+        r = jnp.sqrt(x[0] ** 2 + x[1] ** 2)
+        return -js.laplacian(u)(x) - u(x) / (a + r) ** 4 - known(x)
+
+    return _polygon(f"oscillatory, 1/({count} pi)", UNIT, exact, pde)
+
+
+def front(a: float, centre: tuple[float, float], radius: float, name: str) -> Case:
+    def exact(x):
+        return jnp.arctan(a * (jnp.sqrt((x[0] - centre[0]) ** 2 + (x[1] - centre[1]) ** 2) - radius))
+
+    return _poisson(f"wave front, {name}", UNIT, exact)
+
+
+def interior_line(a: float = 2.5, b: float = 0.6) -> Case:
+    def exact(x):
+        s = x[0] - b * (x[1] + 1)
+        return jnp.cos(np.pi * x[1] / 2) + jnp.where(s > 0, jnp.where(s > 0, s, 1.0) ** a, 0.0)
+
+    def pde(u, x):
+        s = x[0] - b * (x[1] + 1)
+        bent = jnp.where(s > 0, a * (a - 1) * jnp.where(s > 0, s, 1.0) ** (a - 2) * (1 + b * b), 0.0)
+        return js.laplacian(u)(x) + np.pi**2 / 4 * jnp.cos(np.pi * x[1] / 2) - bent
+
+    return _polygon("interior line singularity", SQUARE, exact, pde)
+
+
+def several() -> Case:
+    """A corner, a peak, a front and a boundary layer at once."""
+    angle, cut = 1.5 * np.pi, 1.75 * np.pi
+    a = np.pi / angle
+
+    def smooth(x):
+        front = jnp.arctan(200.0 * (jnp.sqrt(x[0] ** 2 + (x[1] + 0.75) ** 2) - 0.75))
+        peak = jnp.exp(-1000.0 * ((x[0] + np.sqrt(5) / 4) ** 2 + (x[1] + 0.25) ** 2))
+        return front + peak + jnp.exp(-(1 + x[1]) / 0.01)
+
+    def exact(x):
+        r, t = polar(x, cut)
+        return jnp.where(r > 0, jnp.where(r > 0, r, 1.0) ** a * jnp.sin(a * t), 0.0) + smooth(x)
+
+    polygon = sector(angle)
+    return _polygon(
+        "several difficulties", polygon, exact, lambda u, x: js.laplacian(u)(x) - jnp.trace(jax.hessian(smooth)(x))
+    )
+
+
+CASES: dict[str, Callable[[], Case]] = {
+    "analytic": analytic,
+    "corner-180": lambda: reentrant(np.pi + 0.01, "pi + 0.01"),
+    "corner-270": lambda: reentrant(1.5 * np.pi, "3 pi / 2"),
+    "corner-360": lambda: reentrant(2 * np.pi, "2 pi"),
+    "elastic-1": lambda: elastic(1),
+    "elastic-2": lambda: elastic(2),
+    "peak-3": lambda: peak(1e3, (0.5, 0.5)),
+    "peak-5": lambda: peak(1e5, (0.51, 0.117)),
+    "layer-1": lambda: layer(1e-1),
+    "layer-3": lambda: layer(1e-3),
+    "line": line,
+    "oscillatory-10": lambda: oscillatory(10),
+    "oscillatory-50": lambda: oscillatory(50),
+    "front-20": lambda: front(20.0, (-0.05, -0.05), 0.7, "mild"),
+    "front-1000": lambda: front(1000.0, (-0.05, -0.05), 0.7, "steep"),
+    "front-asymmetric": lambda: front(1000.0, (1.5, 0.25), 0.92, "asymmetric"),
+    "front-well": lambda: front(50.0, (0.5, 0.5), 0.25, "well"),
+    "interior-line": interior_line,
+    "several": several,
+}
+LEFT_OUT = ("battery", "intersecting interfaces")

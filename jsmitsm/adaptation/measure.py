@@ -1,0 +1,109 @@
+"""The error of a solution in the measure of the tolerance, and what every particle contributes to it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jsmitsm.runtime.errors import SolveError
+from jsmitsm.solution.solution import Solution
+from jsmitsm.taylor.multi_indices import multi_indices
+
+NORMS = ("max", "l2")
+Quantity = Callable[[Solution], Any]
+
+
+@dataclass(frozen=True)
+class Measured:
+    """error: relative, in the measure of the tolerance; infinite where there is none. contribution (N,): of every
+    particle to it, in a scale of their own. scale: the largest |u|. number: of the quantity, if there is one."""
+
+    error: float
+    contribution: np.ndarray
+    scale: float
+    number: float | None = None
+
+
+def measured(sol: Solution, spacing: np.ndarray, order: int, norm: str, quantity: Quantity | None) -> Measured:
+    """What the estimate says of a solution; order: that of the operator."""
+    values = np.asarray(sol.u).reshape(len(sol.cloud), -1)
+    scale = float(np.abs(values).max(initial=0.0))
+    try:
+        found = sol.correction()
+        error = np.asarray(found.error)
+        fine = np.isfinite(values).all() and np.isfinite(error).all()
+    except (ValueError, SolveError):
+        fine = False
+    if not fine:
+        return Measured(np.inf, np.ones(len(values)), scale)
+    # A defect of u is one of the equation times spacing^order; with the volume around it counts for all of the domain.
+    far = (spacing / spacing.max()) ** min(0, sol.cloud.dim - order) if found.adjoint is not None else 1.0
+    defect = np.asarray(found.error if found.defect is None else found.defect)
+    contribution = far * np.abs(defect).max(axis=1)
+    relative = size(error, values, spacing, norm, sol.cloud.dim)
+    if quantity is None:
+        return Measured(relative, contribution, scale)
+    number, weights = _weights(sol, quantity)
+    if weights is None:  # nothing differentiable: the whole solution stands for the number
+        return Measured(relative, contribution, scale, number)
+    away = abs(float(np.sum(weights * error))) / (abs(number) or scale or 1.0)
+    if found.adjoint is not None:
+        contribution = np.abs(found.adjoint(weights) * np.asarray(found.defect)).max(axis=1)
+    return Measured(away, contribution, scale, number)
+
+
+def size(error: np.ndarray, values: np.ndarray, spacing: np.ndarray, norm: str, dim: int) -> float:
+    """An error (N, F) of values (N, F), relative to the largest or, by the volumes, to their root mean square."""
+    if norm == "max":
+        part, whole = np.abs(error).max(initial=0.0), np.abs(values).max(initial=0.0)
+    else:
+        largest = max(float(np.abs(values).max(initial=0.0)), 1e-300)
+        volume = spacing[:, None] ** dim
+        part, whole = (np.sqrt(np.mean((x / largest) ** 2 * volume)) for x in (error, values))
+    return float(part / whole) if whole > 0 else float(part)
+
+
+def gaps(sol: Solution) -> np.ndarray | None:
+    """By how much the polynomials of neighbours differ halfway between them (N,); None where they cannot be had.
+
+    What happens within a spacing, unseen by the particles, parts them: a layer at a wall, for instance.
+    """
+    try:
+        found = np.asarray(sol.coefficients, float)
+    except (ValueError, SolveError):
+        return None  # a source that is infinite on the boundary
+    from scipy.spatial import cKDTree
+
+    found = found.reshape(*found.shape[:2], -1)
+    points, dim = np.asarray(sol.cloud.points), sol.cloud.dim
+    near = cKDTree(points).query(points, k=range(2, min(2 * dim + 1, len(points)) + 1))[1]
+    index = multi_indices(dim, sol.order + sol.depth)
+    worst = np.zeros(len(points))
+    for k in range(near.shape[1]):
+        half = 0.5 * (points[near[:, k]] - points)
+        powers = np.stack([np.prod(half ** np.array(a), axis=1) for a in index], axis=1)
+        back = powers * np.array([(-1.0) ** sum(a) for a in index])
+        apart = np.einsum("nk,nkf->nf", powers, found) - np.einsum("nk,nkf->nf", back, found[near[:, k]])
+        worst = np.maximum(worst, np.abs(apart).max(axis=1))
+    return worst if np.isfinite(worst).all() else None
+
+
+def _weights(sol: Solution, quantity: Quantity) -> tuple[float, np.ndarray | None]:
+    """The number, and its derivatives (N, F) by the values; None where JAX cannot differentiate it."""
+    values = jnp.asarray(sol.u).reshape(len(sol.cloud), -1)
+
+    def number(values: Any) -> Any:
+        (_, *rest), recipe = sol.tree_flatten()
+        rest[2] = None  # the local polynomials follow the values
+        return jnp.sum(jnp.asarray(quantity(Solution.tree_unflatten(recipe, (values, *rest)))))
+
+    try:
+        made, slope = jax.value_and_grad(number)(values)
+        return float(made), np.asarray(slope)
+    except (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError, TypeError):
+        return float(np.asarray(quantity(sol)).sum()), None

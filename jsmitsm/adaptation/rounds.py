@@ -1,0 +1,262 @@
+"""The rounds of a search: solve, estimate, mark, make a new cloud."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+
+from jsmitsm.adaptation.data import Data, data_of, unresolved
+from jsmitsm.adaptation.first_cloud import Make, made
+from jsmitsm.adaptation.layers import layers
+from jsmitsm.adaptation.marking import ROUGH, Marks, marks, next_spacing
+from jsmitsm.adaptation.measure import Measured, Quantity, gaps, measured, size
+from jsmitsm.adaptation.spacing_field import SpacingField
+from jsmitsm.cloud.cloud import Cloud
+from jsmitsm.equation.problem import Problem
+from jsmitsm.runtime.errors import SolveError
+from jsmitsm.solution.solution import Solution
+from jsmitsm.solution.solve import solve
+
+# Orders that may be used: two more are needed for the estimate, and two more for the estimate of the check.
+ORDERS = tuple(range(1, 13))
+# With "auto": up to which tolerance an order serves, by dimension; while the error is rough, the first.
+_LADDER = {
+    1: ((1e-2, 4), (0.0, 8)),
+    2: ((2e-3, 4), (1e-5, 6), (0.0, 8)),
+    3: ((1e-3, 4), (0.0, 6)),
+}
+# A rough solution that a round leaves with this part of its error gets no better by particles.
+_HOPE = 0.5
+# Polynomials of neighbours may differ between them by so many tolerances.
+_GAP = 10.0
+# So many solves in a row may fail, each followed by one on a finer cloud.
+_REFUSED = 4
+# A cloud grows at most by this factor, small ones by more; large ones at least by the next.
+_GROWTH, _SMALL, _LEAST, _LARGE = 5.0, {1: 400, 2: 1500, 3: 3000}, 1.5, 5000
+# The look at source and coefficients, in parts of the largest |u|; degree of the polynomials it compares with.
+_PART, _DEGREE = 0.05, 4
+# After so many rounds without a smaller error by this factor the search ends.
+_STALLED, _BETTER = 3, 0.7
+# Estimates of two orders may differ by this factor where both are right.
+_AGREE = 3.0
+
+
+class Rounds:
+    """A search in progress, and its result."""
+
+    def __init__(
+        self, problem: Problem, make: Make, tol: float, order: Any, quantity: Quantity | None, norm: str,
+        max_particles: int, max_rounds: int, options: dict[str, Any], began: float,
+    ):  # fmt: skip
+        self.problem, self.make, self.tol, self.quantity, self.norm = problem, make, tol, quantity, norm
+        self.max_particles, self.max_rounds, self.options, self.wanted_order = max_particles, max_rounds, options, order
+        self.clock = began
+        self.solution: Solution = None  # type: ignore[assignment]
+        self.error, self.reached = np.inf, False
+        self.number: float | None = None
+        self.flags: list[str] = []
+        self.messages: list[str] = []
+        self.rows: list[tuple[int, int, float, float, float]] = []
+        self.data: Data | None = None
+        self.least, self.highest, self.shallow = 1, ORDERS[-1], False
+        self.before: Marks | None = None
+        self.apart: np.ndarray | None = None  # gaps between neighbours, where they are what is wrong
+
+    def history(self) -> dict[str, np.ndarray]:
+        names = ("particles", "order", "error", "seconds", "smallest")
+        return {name: np.array(column) for name, column in zip(names, zip(*self.rows))}
+
+    # ------------------------------------------------------------------ the loop
+
+    def run(self, cloud: Cloud, spacing: SpacingField, shown: Any) -> None:
+        self.data = data_of(self.problem, cloud.dim, _DEGREE)
+        if self.data is not None:
+            self.least = max(self.data.traced.order)
+            spacing, cloud = self._looked_at(cloud, spacing, 1.0)
+        refused = 0
+        for number in range(self.max_rounds):
+            try:
+                sol, found = self._solved(cloud, spacing)
+            except (ValueError, SolveError) as error:
+                refused += 1
+                if refused > _REFUSED or not _refinable(error) or number == self.max_rounds - 1:
+                    if self.solution is None:
+                        raise
+                    self.messages.append(f"Limited by a solve that failed: {error}")
+                    return
+                spacing = spacing.scaled(0.7)
+                cloud = self._cloud(spacing)
+                continue
+            refused = 0
+            shown.update(1)
+            shown.note(f"{len(cloud)} particles, error {found.error:.1e}")
+            if self._done(sol, found, cloud, spacing):
+                return
+            if number == self.max_rounds - 1:
+                self._limit(f"the {self.max_rounds} rounds that were allowed (max_rounds)")
+                return
+            if self._stalled():
+                self._limit("what the cloud or round-off allow: the last rounds gained nothing")
+                return
+            following = self._next(found, cloud, spacing)
+            if following is None:
+                return
+            spacing, cloud = following
+
+    def _limit(self, what: str) -> None:
+        between = "" if self.apart is None else " at the particles, more between them"
+        self.messages.append(f"Not reached: the error is estimated at {self.error:.1e}{between}; limited by {what}.")
+        if self.solution is not None and not self.flags:
+            self.flags = self.solution.flags
+
+    def _solved(self, cloud: Cloud, spacing: SpacingField) -> tuple[Solution, Measured]:
+        order = self._order(cloud)
+        sol = self._solve(cloud, order)
+        h = spacing(np.asarray(cloud.points))
+        found = measured(sol, h, self._operator_order(sol), self.norm, self.quantity)
+        now = time.perf_counter()
+        self.rows.append((len(cloud), order, found.error, now - self.clock, float(h.min())))
+        self.clock = now
+        self.solution, self.error, self.number = sol, found.error, found.number
+        return sol, found
+
+    def _solve(self, cloud: Cloud, order: int, start: Any = None) -> Solution:
+        options = dict(self.options)
+        if start is None and self.solution is not None and self.solution.iterations != 1 and self.solution.converged:
+            start = np.asarray(self.solution(np.asarray(cloud.points), outside="extrapolate"))
+        if start is not None:
+            options["u0"] = start
+        depth = 0 if self.shallow else "auto"
+        return solve(self.problem, cloud, order=order, throw=True, **{"depth": depth, **options})
+
+    def _operator_order(self, sol: Solution) -> int:
+        return max(sol.operator_orders)
+
+    # ------------------------------------------------------------------ orders
+
+    def _order(self, cloud: Cloud) -> int:
+        if self.wanted_order != "auto":
+            return int(self.wanted_order)
+        ladder = _LADDER[cloud.dim]
+        wanted = next(order for limit, order in ladder if self.tol >= limit)
+        if not self.rows or self.rows[-1][2] > ROUGH:
+            wanted = min(wanted, ladder[0][1])
+        if len(self.rows) > 1 and self.rows[-1][2] > max(ROUGH, _HOPE * self.rows[-2][2]):
+            # More particles do not help: Taylor polynomials of something that is not smooth, the fewer the better.
+            self.highest, self.shallow = min(self.highest, max(self.rows[-1][1] - 2, self.least)), True
+        return max(min(wanted, self.highest), self.least)
+
+    # ------------------------------------------------------------------ clouds
+
+    def _cloud(self, spacing: SpacingField) -> Cloud:
+        return made(self.make, spacing)
+
+    def _looked_at(self, cloud: Cloud, spacing: SpacingField, scale: float) -> tuple[SpacingField, Cloud]:
+        """A first cloud that sees source, coefficients, and the layers that the operator makes."""
+        assert self.data is not None
+        part, coarse, most = _PART, 1.0, self.max_particles // 4
+        at, thin = layers(self.data, cloud, spacing(np.asarray(cloud.points)))
+        for _ in range(20):
+            finer = spacing
+            if not self.data.plain:
+                points, width = unresolved(self.data, cloud, spacing.largest_used, part, scale, most)
+                finer = finer.joined(points, 1.5 * coarse * width)
+            finer = finer.joined(at, coarse * thin)
+            if finer is spacing:
+                break
+            try:
+                found = self._cloud(finer)
+            except ValueError as error:
+                if "cells" not in str(error):
+                    raise
+                coarse *= 4.0
+                continue
+            if len(found) <= most:
+                return finer, found
+            part, coarse = 4.0 * part, 2.0 * coarse
+        return spacing, cloud
+
+    # ------------------------------------------------------------------ ends
+
+    def _done(self, sol: Solution, found: Measured, cloud: Cloud, spacing: SpacingField) -> bool:
+        """Whether the tolerance is reached, all doubts heard."""
+        if not found.error <= self.tol:
+            return False
+        self._checked(sol, cloud, spacing)
+        self.flags = sol.flags
+        apart = None if self.quantity is not None or self.norm != "max" else gaps(sol)
+        self.apart = None
+        if apart is not None and apart.max() > _GAP * self.tol * found.scale:
+            self.apart = apart
+        self.reached = self.error <= self.tol and not self.flags and self.apart is None
+        return self.reached
+
+    def _checked(self, sol: Solution, cloud: Cloud, spacing: SpacingField) -> None:
+        """The distance to a solve of another order: where it is larger than the estimate, that is the error."""
+        try:
+            other = self._solve(cloud, sol.order + 2, None if sol.iterations == 1 else np.asarray(sol.u))
+        except (ValueError, SolveError) as error:
+            self.messages.append(f"No solve of another order could check the error: {error}")
+            return
+        if self.quantity is None:
+            values = np.asarray(sol.u).reshape(len(cloud), -1)
+            away = np.asarray(other.u).reshape(len(cloud), -1) - values
+            apart = size(away, values, spacing(np.asarray(cloud.points)), self.norm, cloud.dim)
+        else:
+            number, again = self.number or 0.0, float(np.asarray(self.quantity(other)).sum())
+            apart = abs(again - number) / (abs(number) or 1.0)
+        if apart > self.error:
+            self.error = apart
+
+    def _stalled(self) -> bool:
+        errors = [row[2] for row in self.rows]
+        if len(errors) <= _STALLED or len({row[1] for row in self.rows[-_STALLED - 1 :]}) > 1:
+            return False
+        grown = self.rows[-1][0] > max(self.rows[-_STALLED][0], _SMALL[self.solution.cloud.dim])
+        return grown and min(errors[-_STALLED:]) > _BETTER * min(errors[:-_STALLED])
+
+    # ------------------------------------------------------------------ the next cloud
+
+    def _next(self, found: Measured, cloud: Cloud, spacing: SpacingField) -> tuple[SpacingField, Cloud] | None:
+        points, h = np.asarray(cloud.points), spacing(np.asarray(cloud.points))
+        power = self.solution.order + 1.0 + min(0, cloud.dim - self._operator_order(self.solution))
+        trusted = len(self.rows) > 1 and self.rows[-2][1] == self.rows[-1][1] and np.isfinite(found.error)
+        contribution, error = found.contribution, self.error if np.isfinite(self.error) else 1e3
+        if self.apart is not None:
+            contribution, error = self.apart, float(self.apart.max()) / found.scale / _GAP
+            trusted, self.apart = False, None
+        here = marks(points, h, contribution, power, self.before if trusted else None)
+        self.before = here if np.isfinite(found.error) else None
+        if len(cloud) >= self.max_particles:
+            self._limit(f"the {self.max_particles} particles that were allowed (max_particles)")
+            return None
+        most = min(max(_GROWTH * len(cloud), _SMALL[cloud.dim]), self.max_particles)
+        wanted = self.tol if error > self.tol else 0.5 * error
+        made_h, count = next_spacing(here, power, error, wanted, most)
+        field = SpacingField(points, made_h, spacing.largest)
+        for _ in range(8):
+            try:
+                following = self._cloud(field)
+            except ValueError as refusal:
+                if "cells" not in str(refusal) and "too coarse" not in str(refusal):
+                    raise
+                field = SpacingField(points, np.maximum(field.spacing, 4.0 * field.spacing.min()), spacing.largest) if (
+                    "cells" in str(refusal)) else field.scaled(0.7)  # fmt: skip
+                continue
+            if len(following) > self.max_particles:
+                field = field.scaled((1.1 * len(following) / self.max_particles) ** (1.0 / cloud.dim))
+            elif len(following) < _LEAST * len(cloud) and len(cloud) > _LARGE:
+                field = field.scaled((len(following) / (1.1 * _LEAST * len(cloud))) ** (1.0 / cloud.dim))
+            else:
+                break
+        else:
+            self._limit("the cloud's maker, which refused finer ones")
+            return None
+        return field, following
+
+
+def _refinable(error: Exception) -> bool:
+    """Whether more particles may mend what a solve refused."""
+    return isinstance(error, SolveError) or str(error).startswith(("cloud:", "stencils:"))

@@ -1,0 +1,1 @@
+"""What filling a domain is made of: cells, lattices, repulsion."""

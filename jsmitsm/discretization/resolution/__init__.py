@@ -1,0 +1,1 @@
+"""What neighbours know of each other's coefficients and sources."""

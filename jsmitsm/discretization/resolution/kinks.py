@@ -1,0 +1,81 @@
+"""Sources with kinks and jumps: where a Taylor series misses the neighbours' values, a fit of them takes its place."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from jsmitsm.discretization.layout import Class, Discretization
+from jsmitsm.runtime.tracers import is_traced
+from jsmitsm.taylor.multi_indices import multi_indices
+
+# A quadratic fit takes the place of the series where its misfit is less than the first part of the series', and that is
+# more than the second times its last two degrees and more than the third of the source.
+BETTER, MISLED, FAINT = 0.5, 3.0, 1e-6
+DEGREE = 2
+RIDGE = 1e-10
+
+
+def softened(disc: Discretization, ids: np.ndarray, source: Any, values: Any) -> Any:
+    """The source's Taylor coefficients (rows, n) at the particles ``ids``, without the series that mislead.
+
+    values (E, N): the source at all particles. Beside a kink a series tells of one side only, and the deeper the
+    recursion goes the more it makes of it. What is smooth, resolved or not, stays as it is.
+    """
+    xp = jnp if is_traced(source, values, disc.points) or any(is_traced(c.neighbours) for c in disc.classes) else np
+    source, place = xp.asarray(source), np.full(len(disc.cloud), -1)
+    place[ids] = np.arange(len(ids))
+    for cls in disc.classes:
+        at = place[cls.ids]
+        for equation in range(len(disc.rec.levels)):
+            rows = np.array([k for k, (e, _) in enumerate(disc.rec.row_index) if e == equation])
+            new = _judged(disc, cls, equation, source[rows][:, at], xp.asarray(values)[equation], xp)
+            if xp is np:
+                source = source.copy()
+                source[rows[:, None], at] = new
+            else:
+                source = source.at[rows[:, None], at].set(new)
+    return source
+
+
+def _judged(disc: Discretization, cls: Class, equation: int, series: Any, values: Any, xp: Any) -> Any:
+    """The series (T, n) of one equation's source at the particles of a class, or what is fitted to its values (N,)."""
+    dim, degree = disc.rec.dim, disc.rec.degrees[equation]
+    near, points = xp.asarray(cls.neighbours), xp.asarray(disc.points)
+    valid = near >= 0
+    offset = xp.where(valid[..., None], points[xp.where(valid, near, 0)] - points[cls.ids][:, None], 0.0)
+    square = xp.sum(offset**2, axis=2)
+    length = xp.sqrt(xp.max(square, axis=1))
+    there = values[disc.images.owners(xp.where(valid, near, cls.ids[:, None]))]
+    degrees = np.array([sum(c) for c in multi_indices(dim, degree)])
+    terms = [_monomial(offset, c) * f[:, None] for c, f in zip(multi_indices(dim, degree), series)]
+    last = [t for t, k in zip(terms, degrees) if k > max(degree - 2, 0)]
+    count = xp.sum(valid, axis=1)
+    mean = lambda x: xp.sum(xp.where(valid, x, 0.0) ** 2, axis=1) / count
+    misled, promised = mean(sum(terms) - there), mean(sum(last, xp.zeros(valid.shape)))
+    fit, missed = _fitted(offset / length[:, None, None], valid, there, dim, xp)
+    switch = (missed < BETTER**2 * misled) & (misled > MISLED**2 * promised) & (misled > FAINT**2 * mean(there))
+    scaled = fit.T / length ** np.array([sum(c) for c in multi_indices(dim, DEGREE)])[:, None]
+    kept = min(len(scaled), len(series))
+    fitted = xp.concatenate([scaled[:kept], xp.zeros((len(series) - kept, len(cls.ids)))])
+    return xp.where(switch, fitted, series)
+
+
+def _monomial(offset: Any, c: tuple[int, ...]) -> Any:
+    out = 1.0
+    for axis, power in enumerate(c):
+        out = out * offset[..., axis] ** power
+    return out * (offset[..., 0] * 0.0 + 1.0) if not any(c) else out
+
+
+def _fitted(offset: Any, valid: Any, values: Any, dim: int, xp: Any) -> tuple[Any, Any]:
+    """Coefficients (n, M) of quadratic functions fitted to the values (n, w), and their mean square misfit."""
+    p = xp.stack([_monomial(offset, c) for c in multi_indices(dim, DEGREE)], axis=2)
+    weight = xp.where(valid, xp.exp(-4.0 * xp.sum(offset**2, axis=2)), 0.0)
+    moments = xp.einsum("nwa,nw,nwb->nab", p, weight, p)
+    moments = moments + RIDGE * np.eye(moments.shape[1])
+    fit = xp.linalg.solve(moments, xp.einsum("nwa,nw,nw->na", p, weight, values)[..., None])[..., 0]
+    missed = xp.where(valid, xp.einsum("nwa,na->nw", p, fit) - values, 0.0)
+    return fit, xp.sum(missed**2, axis=1) / xp.sum(valid, axis=1)

@@ -1,0 +1,1 @@
+"""Problems with several regions: an equation for each, conditions on their interfaces."""

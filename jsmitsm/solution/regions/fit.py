@@ -1,0 +1,106 @@
+"""What a solution in several regions can be asked later: its local polynomials and its error."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jsmitsm.discretization.held_particles import held_particles
+from jsmitsm.discretization.layout import sorted_classes
+from jsmitsm.discretization.leave_one_out import with_held
+from jsmitsm.discretization.regions.layout import Regions, discretize_regions
+from jsmitsm.discretization.regions.rows import region_numbers, whole_coefficients
+from jsmitsm.runtime.progress import bar
+from jsmitsm.runtime.tracers import concrete, is_traced
+from jsmitsm.solution.fit import Recipe
+from jsmitsm.solution.regions.run import RegionsRun
+from jsmitsm.taylor.multi_indices import HIGHEST, multi_indices
+
+
+@jax.tree_util.register_pytree_node_class
+class RegionsFit:
+    """What it takes to fit the local polynomials of a solution again; see :class:`jsmitsm.solution.fit.Fit`."""
+
+    def __init__(self, problem: Any, cloud: Any, neighbours: Any, taylor: Any, recipe: Recipe):
+        self.problem, self.cloud = problem, cloud
+        self.neighbours, self.taylor, self.recipe = neighbours, taylor, recipe
+
+    def discretization(self) -> Regions:
+        r = self.recipe
+        return discretize_regions(self.problem, self.cloud, r.order, r.depth, np.asarray(self.neighbours))
+
+    @bar("fitting")
+    def coefficients(self, values: Any) -> Any:
+        """Taylor coefficients (N, F, K) of every particle, of those with held values too."""
+        regions, taylor = self.discretization(), self.taylor
+        bound = {i for m in regions.meetings for i in m.copies}
+        if taylor is not None and regions.held.all(axis=1).any():
+            # Those of held particles are continued from others; fitted where that is linearised they are their own.
+            fitted = self._fitted(regions, bound, taylor, values)
+            held = np.zeros(len(self.cloud), bool)
+            for p in regions.parts:
+                held[p.ids[held_particles(p.disc)]] = True
+            taylor = (jnp if is_traced(fitted, taylor) else np).where(held[:, None, None], fitted, taylor)
+        return self._fitted(regions, bound, taylor, values)
+
+    def _fitted(self, regions: Regions, bound: set[int], taylor: Any, values: Any) -> Any:
+        for p in regions.parts:
+            alone = np.array([k for k, i in enumerate(p.ids) if int(i) not in bound], int)
+            p.disc.classes = sorted_classes(p.disc, alone, p.disc.stencils)
+        nums = region_numbers(regions, taylor, everywhere=True)
+        return whole_coefficients(regions, nums, values)
+
+    @bar("error estimate")
+    def error_estimate(self, values: Any) -> Any:
+        """The distance (N,) or (N, F) to the solution of order p + 2."""
+        order = self.recipe.order + 2
+        if order > HIGHEST:
+            raise ValueError(
+                f"error_estimate: needs expansions of order p + 2 = {order}, and {HIGHEST} is the highest; solve at "
+                f"order {HIGHEST - 2} or below, or compare with the solution on a finer cloud"
+            )
+        if concrete(self.cloud.points) is None or is_traced(self.cloud.points):
+            raise ValueError(
+                "error_estimate: the points are traced by a JAX transform, and the wider stencils it needs are found "
+                "on the host; ask for it outside the transform"
+            )
+        regions = discretize_regions(self.problem, self.cloud, order, self.recipe.depth)
+        run, taylor = RegionsRun(regions, "auto", True, True), self.taylor
+        if taylor is not None:
+            more = len(multi_indices(regions.rec.dim, regions.rec.reach)) - taylor.shape[2]
+            taylor = (jnp if is_traced(taylor) else np).pad(taylor, ((0, 0), (0, 0), (0, more)))
+        nums = run.numbers(taylor)
+        reference = with_held(regions, nums, run.solved(*run.assembled(nums), balanced=False)[0])  # type: ignore[arg-type]
+        error = abs(reference - values)
+        return error[:, 0] if regions.rec.fields == 1 else error
+
+    def tree_flatten(self):
+        return (self.problem, self.cloud, self.neighbours, self.taylor), self.recipe
+
+    @classmethod
+    def tree_unflatten(cls, recipe, leaves):
+        return cls(*leaves, recipe)
+
+
+@jax.tree_util.register_pytree_node_class
+class RegionPart:
+    """The fit of one region of a solution: that of the whole, of which it takes its particles."""
+
+    def __init__(self, whole: Any, values: Any, ids: tuple[int, ...]):
+        self.whole, self.values, self.ids = whole, values, ids
+
+    def coefficients(self, _: Any) -> Any:
+        return self.whole.coefficients(self.values)[np.array(self.ids)]
+
+    def error_estimate(self, _: Any) -> Any:
+        return self.whole.error_estimate(self.values)[np.array(self.ids)]
+
+    def tree_flatten(self):
+        return (self.whole, self.values), self.ids
+
+    @classmethod
+    def tree_unflatten(cls, ids, leaves):
+        return cls(*leaves, ids)

@@ -1,0 +1,262 @@
+"""Problems with several regions: exactness, order, jumps and contacts, junctions, systems, gradients, refusals."""
+
+import pickle
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jsmitsm as js
+
+BOX = ((-1.0, -1.0), (1.0, 1.0))
+DISK = js.sdf.circle((0.0, 0.0), 0.5)
+SHAPES = {"in": DISK, "out": js.sdf.difference(js.sdf.rectangle(*BOX), DISK)}
+DISKS = {h: js.regions(SHAPES, BOX, h) for h in (0.16,)}
+
+
+def laplace(u, x):
+    return js.laplacian(u)(x)
+
+
+def conduction(k):
+    return {name: lambda u, x, n, c=c: c * n @ js.grad(u)(x) for name, c in k.items()}
+
+
+def values(cloud, exact):
+    out = np.zeros(len(cloud))
+    for name, function in exact.items():
+        out[cloud.regions[name]] = jax.vmap(function)(cloud.points[cloud.regions[name]])
+    return out
+
+
+def error(sol, exact):
+    truth = values(sol.cloud, exact)
+    return np.linalg.norm(sol.u - truth) / np.linalg.norm(truth)
+
+
+def wall(k=(1.0, 50.0, 5.0), ends=(0.0, 0.1, 0.3, 0.35), spacing=0.02):
+    layers = {name: ends[i : i + 2] for i, name in enumerate("abc")}
+    sides = {"left": lambda x: x[:, 0] == ends[0], "right": lambda x: x[:, 0] == ends[-1]}
+    return js.regions(layers, spacing=spacing, groups=sides), dict(zip("abc", k))
+
+
+# ------------------------------------------------------------------ layers
+
+
+def test_a_composite_wall_conducts_as_its_resistances_add_up():
+    cloud, k = wall()
+    q = 1000.0
+    problem = js.Problem(
+        {name: laplace for name in k},
+        {"left": js.condition(lambda u, x, n: k["a"] * n @ js.grad(u)(x) - q), "right": js.dirichlet(20.0),
+         **{i: js.interface(flux=conduction({s: k[s] for s in i.split("|")})) for i in cloud.interfaces}},
+    )  # fmt: skip
+    sol = js.solve(problem, cloud)
+    top = 20 + q * (0.1 / 1 + 0.2 / 50 + 0.05 / 5)
+    assert abs(sol.u[cloud.groups["left"]] - top) < 1e-10 * top
+    assert sol.flags == []
+    assert abs(sol.flux("a|b", 50.0, region="b") + q) < 1e-8 and abs(sol.flux("a|b", 1.0, region="a") + q) < 1e-8
+    # Every layer's values are linear, so is what lies between.
+    assert np.abs(sol([[0.05], [0.2], [0.1]]) - np.array([84.0, 32.0, 34.0])).max() < 1e-9
+    again = pickle.loads(pickle.dumps(sol))
+    assert np.array_equal(again([[0.1]], region="b"), sol([[0.1]], region="b"))
+
+
+def test_jump_source_and_resistance_are_what_they_say():
+    """u'' = 0 on two layers: u_a - u_b + R q_a = j and q_a - q_b = s, with q = k u'."""
+    cloud = js.regions({"a": (0.0, 0.5), "b": (0.5, 1.0)}, spacing=0.1)
+    k, j, s, r = {"a": 2.0, "b": 3.0}, 0.7, 0.4, 0.5
+    flux, ends = conduction(k), {"boundary": js.dirichlet(lambda x: x[0])}
+    problem = js.Problem(dict.fromkeys(k, laplace), {**ends, "a|b": js.interface(flux, j, s, r)})
+    sol = js.solve(problem, cloud)
+    qa, qb = (k[n] * sol.grad([[0.5]], region=n)[0, 0] for n in "ab")
+    left, right = (sol([[0.5]], region=n)[0] for n in "ab")
+    assert abs(left - right + r * qa - j) < 1e-12 and abs(qa - qb - s) < 1e-12
+    # The same by a residual, by functions and arrays.
+    def residual(a, b, x, n):
+        qa, qb = flux["a"](a, x, n), flux["b"](b, x, n)
+        return jnp.array([a(x) - b(x) + r * qa - j, qa - qb - s])
+
+    for condition in (
+        js.interface(residual=residual),
+        js.interface(flux, jump=np.array([j]), source=lambda x: s, resistance=lambda x: 2 * r * x[0]),
+    ):
+        other = js.solve(js.Problem(dict.fromkeys(k, laplace), {**ends, "a|b": condition}), cloud)
+        assert np.abs(other.u - sol.u).max() < 1e-13
+
+
+def test_gradients_with_respect_to_conductivity_resistance_and_place():
+    cloud = js.regions({"a": (0.0, 0.5), "b": (0.5, 1.0)}, spacing=0.125)
+    near = js.stencils(cloud, size=5)
+
+    def loss(p):
+        flux = {"a": lambda u, x, n, p: p["k"] * n @ js.grad(u)(x), "b": lambda u, x, n, p: n @ js.grad(u)(x)}
+        heat = lambda u, x, p: js.laplacian(u)(x) + 1.0  # noqa: E731
+        contact = js.interface(flux, resistance=lambda x, p: p["r"])
+        ends = {"boundary": js.dirichlet(lambda x, p: x[0]), "a|b": contact}
+        # The interface moves, and the particles of both layers with it.
+        x = cloud.points + p["move"] * jnp.minimum(cloud.points, 1.0 - cloud.points)
+        sol = js.solve(js.Problem({"a": heat, "b": heat}, ends, params=p), cloud.replace(points=x), stencils=near)
+        return jnp.sum(sol.u**2) + sol.region("a").u[2]
+
+    here = {"k": 2.0, "r": 0.3, "move": 0.05}
+    slope = jax.grad(loss)(here)
+    for name in here:
+        up, down = ({**here, name: here[name] + d} for d in (1e-5, -1e-5))
+        # Central differences of step 1e-5 are right to about 1e-9.
+        assert abs(slope[name] - (loss(up) - loss(down)) / 2e-5) < 1e-7 * max(1.0, abs(slope[name])), name
+    assert abs(jax.jit(loss)(here) - loss(here)) < 1e-12
+
+
+def test_newton_conductivities_and_contacts_that_depend_on_u():
+    """k_a = 1 + u^2, k_b = 2 and a drop that grows with the square of the flux; the flux q is the same everywhere."""
+    cloud = js.regions({"a": (0.0, 0.5), "b": (0.5, 1.0)}, spacing=0.05)
+    ka = lambda u: 1.0 + u**2  # noqa: E731
+    q, drop = 1.5, 0.1 * 1.5**2
+
+    def residual(a, b, x, n):
+        qa, qb = ka(a(x)) * n @ js.grad(a)(x), 2.0 * n @ js.grad(b)(x)
+        return jnp.array([a(x) - b(x) + 0.1 * qa**2, qa - qb])
+
+    nonlinear = lambda u, x: js.divergence(lambda y: ka(u(y)) * js.grad(u)(y))(x)  # noqa: E731
+    root = float(np.real(min(np.roots([1 / 3, 0, 1, -q * 0.5]), key=lambda z: abs(np.imag(z)))))
+    bcs = {"boundary": js.dirichlet(lambda x: x[0] * (root + drop + q * 0.25)), "a|b": js.interface(residual=residual)}
+    sol = js.solve(js.Problem({"a": nonlinear, "b": laplace}, bcs), cloud, order=6)
+    assert sol.converged and sol.iterations < 9
+    # u + u^3 / 3 = q x in a; what order 6 on 11 particles leaves.
+    x, u = cloud.points[cloud.regions["a"], 0], sol.region("a").u
+    assert np.abs(u + u**3 / 3 - q * x).max() < 2e-6
+    assert abs(sol([[0.5]], region="b")[0] - root - drop) < 2e-6
+
+
+# ------------------------------------------------------------------ the plane
+
+
+def test_polynomials_of_the_order_are_exact_on_both_sides():
+    """Harmonic polynomials of degree 4, one on each side, with the jumps of values and fluxes that they have."""
+    cloud, k = DISKS[0.16], {"in": 10.0, "out": 1.0}
+    exact = {"in": lambda x: x[0] ** 4 - 6 * x[0] ** 2 * x[1] ** 2 + x[1] ** 4, "out": lambda x: 1 + x[0] * x[1]}
+    pairs, normals = cloud.interfaces["in|out"], cloud.interface_normals["in|out"]
+    at = cloud.points[pairs[:, 0]]
+    source = jax.vmap(lambda x, n: n @ (10.0 * jax.grad(exact["in"])(x) - jax.grad(exact["out"])(x)))(at, normals)
+    jump = jax.vmap(lambda x: exact["in"](x) - exact["out"](x))(at)
+    condition = js.interface(conduction(k), jump=jump, source=source)
+    problem = js.Problem(dict.fromkeys(k, laplace), {"boundary": js.dirichlet(exact["out"]), "in|out": condition})
+    sol = js.solve(problem, cloud)
+    assert error(sol, exact) < 1e-12
+    # The difference of the two equations of a pair is its jump.
+    assert np.abs(sol.u[pairs[:, 0]] - sol.u[pairs[:, 1]] - jump).max() < 1e-12 * np.abs(sol.u).max()
+    assert sol.stats["lebesgue_interfaces"] < 1.5
+    points = np.array([[0.1, 0.2], [0.8, -0.7]])
+    truth = [exact["in"](points[0]), exact["out"](points[1])]
+    assert np.abs(sol(points) - np.array(truth)).max() < 1e-11
+    assert abs(sol.integral("in|out", region="out") - np.pi) < 1e-2  # of 1 + xy over the circle, cubic arcs
+    for solver in ("iterative", "dense"):
+        assert np.abs(js.solve(problem, cloud, solver=solver).u - sol.u).max() < 1e-9
+
+
+@pytest.mark.parametrize(("k", "bound"), [(1e6, 1.2e-3), (1e-3, 1.5e-3)])
+def test_an_inclusion_of_any_conductivity(k, bound):
+    """u = x + (1 - k) / (1 + k) R^2 x / r^2 outside. At h = 0.16 a prototype had 5.7e-4 and 4.9e-4."""
+    exact = {"in": lambda x: 2 / (1 + k) * x[0], "out": lambda x: x[0] + (1 - k) / (1 + k) * 0.25 * x[0] / (x @ x)}
+    bcs = {"boundary": js.dirichlet(exact["out"]), "in|out": js.interface(conduction({"in": k, "out": 1.0}))}
+    sol = js.solve(js.Problem(dict.fromkeys(exact, laplace), bcs), DISKS[0.16])
+    assert error(sol, exact) < bound
+    assert sol.flags == []
+
+
+def test_regions_meet_in_a_point_and_a_singular_one_is_told():
+    """Four quadrants: where their conductivities alternate u is r^0.39 f(angle); where all are equal it is smooth."""
+    corner = {"a": (0, 0), "b": (-1, 0), "c": (-1, -1), "d": (0, -1)}
+    shapes = {n: [(x, y), (x + 1, y), (x + 1, y + 1), (x, y + 1)] for n, (x, y) in corner.items()}
+    cloud = js.regions(shapes, spacing=0.125)
+
+    def solved(k, boundary):
+        bcs = {i: js.interface(conduction({s: k[s] for s in i.split("|")})) for i in cloud.interfaces}
+        return js.solve(js.Problem(dict.fromkeys(k, laplace), {"boundary": js.dirichlet(boundary), **bcs}), cloud)
+
+    smooth = solved(dict.fromkeys("abcd", 2.0), lambda x: x[0] * x[1] + x[0])
+    assert error(smooth, dict.fromkeys("abcd", lambda x: x[0] * x[1] + x[0])) < 1e-12 and smooth.flags == []
+    checkered = solved({"a": 10.0, "b": 1.0, "c": 10.0, "d": 1.0}, lambda x: x[0] + x[1])
+    assert any("singular" in flag for flag in checkered.flags)
+
+
+def test_an_elastic_inclusion_with_linear_displacements_is_exact():
+    """A stiff disk in a soft plate: a linear field in each, the jump of tractions given."""
+    material = {"in": (100.0, 50.0), "out": (1.0, 2.0)}
+    matrix = {"in": np.array([[0.1, 0.3], [-0.2, 0.2]]), "out": np.array([[0.2, 0.1], [0.4, -0.1]])}
+
+    def stress(gradient, name):
+        mu, lam = material[name]
+        strain = (gradient + gradient.T) / 2
+        return 2 * mu * strain + lam * jnp.trace(strain) * jnp.eye(2)
+
+    pde = {n: lambda u, x, n=n: js.divergence(lambda y: stress(js.grad(u)(y), n))(x) for n in material}
+    traction = {n: lambda u, x, normal, n=n: stress(js.grad(u)(x), n) @ normal for n in material}
+    cloud = DISKS[0.16]
+    normals = cloud.interface_normals["in|out"]
+    source = normals @ (stress(matrix["in"], "in") - stress(matrix["out"], "out"))
+    jump = lambda x: (matrix["in"] - matrix["out"]) @ x  # noqa: E731
+    bcs = {"boundary": js.dirichlet(lambda x: matrix["out"] @ x), "in|out": js.interface(traction, jump, source)}
+    sol = js.solve(js.Problem(pde, bcs, fields=2), cloud, order=2)
+    truth = np.concatenate([cloud.points[cloud.regions[n]] @ matrix[n].T for n in material])
+    assert np.abs(sol.u - truth).max() < 1e-12
+
+
+# ------------------------------------------------------------------ refusals
+
+
+def test_conditions_are_never_guessed():
+    cloud = js.regions({"a": (0.0, 0.5), "b": (0.5, 1.0)}, spacing=0.1)
+    flux, both = conduction({"a": 1.0, "b": 2.0}), {"a": laplace, "b": laplace}
+    ends, good = {"boundary": js.dirichlet(0.0)}, js.interface(flux)
+
+    def refused(told, pde=both, bcs=None, cloud=cloud, **options):
+        with pytest.raises(ValueError, match=told):
+            js.solve(js.Problem(pde, {**ends, "a|b": good} if bcs is None else bcs), cloud, **options)
+
+    refused(r"no condition for the interface\(s\) \['a\|b'\].*never guessed", bcs=ends)
+    refused(r"called 'a\|b', not 'b\|a'", bcs={**ends, "b|a": good})
+    refused(r"'a\|c' is no interface of the cloud", bcs={**ends, "a|c": good})
+    refused(r"takes one js.interface", bcs={**ends, "a|b": js.dirichlet(0.0)})
+    refused(r"no equation for the region 'b'", pde={"a": laplace})
+    refused(r"'c' is no region of the cloud", pde={**both, "c": laplace})
+    refused(r"give an equation for each", pde=laplace)
+    refused(r"make it with js.regions", cloud=js.interval(0.0, 1.0, 9), bcs={})
+    refused(r"boundary group\(s\) \['boundary'\]", bcs={"a|b": good})
+    refused(r"flux for \['a', 'c'\]", bcs={**ends, "a|b": js.interface({"a": flux["a"], "c": flux["b"]})})
+    refused(r"does not depend on u", bcs={**ends, "a|b": js.interface({"a": flux["a"], "b": lambda u, x, n: 1.0})})
+    refused(r"takes 2, two for each field", bcs={**ends, "a|b": js.interface(residual=lambda a, b, x, n: a(x) - b(x))})
+    refused(r"method: III is not made for clouds of several regions", method="III")
+    refused(r"interfaces take equations of second order", pde={**both, "b": lambda u, x: js.partial(u, (4,))(x)})
+    dot = js.sdf.circle((0.0, 0.0), 0.15)
+    small = js.regions({"a": dot, "b": js.sdf.difference(js.sdf.rectangle(*BOX), dot)}, BOX, 0.1)
+    refused(r"region 'a' is too small: .* particles are too few", cloud=small, order=8)
+    with pytest.raises(ValueError, match="several regions are solved by js.solve alone"):
+        js.factorize(js.Problem(both, {**ends, "a|b": good}), cloud)
+    with pytest.raises(ValueError, match="give either flux"):
+        js.interface()
+    with pytest.raises(ValueError, match="jump: the residual says everything"):
+        js.interface(residual=lambda a, b, x, n: 0.0, jump=1.0)
+    sol = js.solve(js.Problem(both, {**ends, "a|b": good}), cloud)
+    with pytest.raises(ValueError, match="on which u has two values"):
+        sol.flux("a|b")
+
+
+def test_pictures_and_files_keep_the_jump(tmp_path):
+    plt = pytest.importorskip("matplotlib.pyplot")
+    cloud = js.regions({"a": (0.0, 0.5), "b": (0.5, 1.0)}, spacing=0.25)
+    contact = js.interface(conduction({"a": 1.0, "b": 1.0}), jump=-3.0)
+    problem = js.Problem({"a": laplace, "b": laplace}, {"boundary": js.dirichlet(lambda x: 3.0 * x[0]), "a|b": contact})
+    sol = js.solve(problem, cloud)
+    ax = js.plot.solution(sol)
+    line = ax.lines[0].get_xydata()
+    at = line[np.abs(line[:, 0] - 0.5) < 1e-12][:, 1]
+    assert np.allclose(sorted(set(np.round(at, 9))), [0.0, 3.0], atol=1e-9)
+    plt.close("all")
+    meshio = pytest.importorskip("meshio")
+    mesh = js.files.to_mesh(sol)
+    assert isinstance(mesh, meshio.Mesh) and mesh.cell_data["region"][0].tolist() == [0, 0, 1, 1]
+    js.files.to_csv(sol, tmp_path / "u.csv")
+    assert "region" in (tmp_path / "u.csv").read_text().splitlines()[0]
