@@ -59,8 +59,8 @@ def eigen(
         equation without it.
     method : "S", the only one whose rows know their source.
     order : the degree of the expansions. Errors of values fall as the spacing to the power of the order, or faster.
-    depth : degrees beyond the order of the recursion and of the fit of the source. "auto" is 0: more takes wider
-        stencils and gained nothing.
+    depth : degrees beyond the order of the recursion and of the fit of the source. "auto" is 2 in 1D and 2D, where it
+        gains a factor of 30 to 400, about as much as two orders more do; 0 in 3D.
     stencils : from :func:`jsmitsm.stencils`; needed where JAX traces the points.
     throw : raise where the values are not found; otherwise ``converged`` is False.
 
@@ -105,7 +105,7 @@ def eigen(
             "equation with a mass; ask for fewer (a tenth of them is resolved well), or refine the cloud"
         )
     question = Question(
-        problem, mass, float(near), order, 0 if depth == "auto" else int(depth), pencil, weights, massed
+        problem, mass, float(near), order, pencil.layout.disc.rec.depth, pencil, weights, massed
     )
     size = float(len(cloud))
     known_a, known_c = (concrete(x) for x in (a, c))
