@@ -19,6 +19,7 @@ import numpy as np
 from jsmitsm.evolution.space.system import System
 from jsmitsm.evolution.steps.tableaux import RADAU, Additive
 
+
 class Drive(Protocol):
     """What drives a system: forces F, the held values' part of E, H, and the held values themselves."""
 
