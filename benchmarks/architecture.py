@@ -36,13 +36,16 @@ ROWS = [
     {"particle": (0.0, 1.76), "cloud": (1.92, 1.76), "equation": (3.84, 1.76)},
     {"discretization": (0.0, 5.6)},
     {"solution": (0.0, 7.4)},
-    {"tuning": (0.0, 1.73), "evolution": (1.89, 1.73), "modes": (3.78, 1.73), "show": (5.67, 1.73)},
+    {
+        "tuning": (0.0, 1.38), "adaptation": (1.505, 1.38), "evolution": (3.01, 1.38), "modes": (4.515, 1.38),
+        "show": (6.02, 1.38),
+    },
 ]
 BESIDE = {"linear": (5.76, 1.64)}
 COLOURS = {
     "runtime": "#e6e6e6", "taylor": "#e6e6e6", "particle": "#cfe5f5", "cloud": "#cfe5f5", "equation": "#cfe5f5",
-    "discretization": "#fbe3b5", "linear": "#cdebdf", "solution": "#f7d3c1", "tuning": "#f0dbe8", "modes": "#f0dbe8",
-    "show": "#f0dbe8", "evolution": "#f0dbe8",
+    "discretization": "#fbe3b5", "linear": "#cdebdf", "solution": "#f7d3c1", "tuning": "#f0dbe8",
+    "adaptation": "#f0dbe8", "evolution": "#f0dbe8", "modes": "#f0dbe8", "show": "#f0dbe8",
 }  # fmt: skip
 # What goes from one package to the next on the sheet, and where.
 ARROWS = {
@@ -55,10 +58,11 @@ ARROWS = {
     ("equation", "discretization"): (4.72, "coefficients"),
     ("discretization", "solution"): (2.8, "rows of the global system"),
     ("linear", "solution"): (6.1, "factors"),
-    ("solution", "tuning"): (0.6, "values, estimates"),
-    ("solution", "evolution"): (2.5, "states"),
-    ("solution", "modes"): (4.3, "polynomials"),
-    ("solution", "show"): (6.3, "values"),
+    ("solution", "tuning"): (0.69, "estimates"),
+    ("solution", "adaptation"): (2.19, "defects"),
+    ("solution", "evolution"): (3.7, "states"),
+    ("solution", "modes"): (5.2, "polynomials"),
+    ("solution", "show"): (6.71, "values"),
 }
 # Sizes in points, and a line's height in inches.
 NAME, SAID, LISTED, LINE, PAD = 11, 8.2, 7.4, 0.15, 0.09

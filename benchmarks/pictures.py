@@ -7,7 +7,9 @@ import matplotlib
 import numpy as np
 
 import jsmitsm as js
+from benchmarks.adaptation import true_error
 from benchmarks.commandline import arguments
+from benchmarks.nist import CASES as NIST
 from benchmarks.problems import CASES
 
 matplotlib.use("Agg")
@@ -83,6 +85,15 @@ def modes(plt):
     return fig
 
 
+def adaptation(plt):
+    """A corner singularity to 1e-6, its place unknown."""
+    case = NIST["corner-270"]()
+    found = js.adapt(case.problem, case.make, 1e-6)
+    axes = js.plot.adaptation(found)
+    axes[0].set_title(f"{len(found.cloud)} particles; true error {true_error(case, found):.0e}", fontsize="medium")
+    return axes[0].figure
+
+
 def regions(plt):
     """A disk in a plate, whose contact is imperfect: particles, and a temperature that jumps."""
     disk = js.sdf.circle((0.0, 0.0), 0.5)
@@ -98,7 +109,10 @@ def regions(plt):
     return fig
 
 
-def main(names=("first", "slices", "errors", "regions", "modes")):
+PICTURES = ("first", "slices", "errors", "regions", "modes", "adaptation")
+
+
+def main(names=PICTURES):
     import matplotlib.pyplot as plt
 
     IMAGES.mkdir(parents=True, exist_ok=True)
@@ -110,4 +124,4 @@ def main(names=("first", "slices", "errors", "regions", "modes")):
 
 
 if __name__ == "__main__":
-    main(arguments(__doc__, names="picture").names or ("first", "slices", "errors", "regions", "modes"))
+    main(arguments(__doc__, names="picture").names or PICTURES)
