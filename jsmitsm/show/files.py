@@ -22,9 +22,10 @@ from jsmitsm.runtime.errors import refuse_masked
 from jsmitsm.show.mesh_cloud import cloud_of
 from jsmitsm.show.mesh_files import needed, read_mesh
 from jsmitsm.show.mesh_regions import regions_of
+from jsmitsm.show.series import to_pvd
 from jsmitsm.solution.solution import Solution
 
-__all__ = ["from_csv", "from_mesh", "from_shapely", "to_csv", "to_mesh", "to_pandas", "to_xarray"]
+__all__ = ["from_csv", "from_mesh", "from_shapely", "to_csv", "to_mesh", "to_pandas", "to_pvd", "to_xarray"]
 
 _AXES = "xyz"
 _CELLS = {1: "line", 2: "triangle", 3: "tetra"}

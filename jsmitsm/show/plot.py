@@ -20,9 +20,11 @@ from jsmitsm.cloud.triangulation import simplices
 from jsmitsm.particle.kernels import Kernel
 from jsmitsm.show import drawing
 from jsmitsm.show.drawing import COLOURS, GREY, MARKERS
+from jsmitsm.show.series import animate
 from jsmitsm.solution.solution import Solution
 
-__all__ = ["adaptation", "cloud", "convergence", "error", "estimate", "solution", "sparsity", "tuning", "values"]
+__all__ = ["adaptation", "animate", "cloud", "convergence", "error", "estimate", "solution", "sparsity", "tuning",
+           "values"]  # fmt: skip
 
 
 def cloud(what: Cloud | Solution, *, normals: bool = False, support: int | None = None, kernel: Kernel | None = None,
