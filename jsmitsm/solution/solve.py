@@ -87,13 +87,14 @@ def solve(
     True
     """
     check_tolerance(order, tol)
-    if of_regions(problem, cloud):
-        return solve_regions(
-            problem, cloud, method=method, order=order, kernel=kernel, stencils=stencils, basis_terms=basis_terms,
-            formulation=formulation, solver=solver, u0=u0, throw=throw, depth=depth,
-        )  # fmt: skip
+    several = of_regions(problem, cloud)
 
     def solved(order: Any) -> tuple[Solution, Run]:
+        if several:
+            return solve_regions(
+                problem, cloud, method=method, order=order, kernel=kernel, stencils=stencils, basis_terms=basis_terms,
+                formulation=formulation, solver=solver, u0=u0, throw=throw, depth=depth,
+            )  # fmt: skip
         run = prepared(
             problem, cloud, method=method, order=order, kernel=kernel, stencils=stencils, basis_terms=basis_terms,
             formulation=formulation, solver=solver, u0=u0, throw=throw, depth=depth,

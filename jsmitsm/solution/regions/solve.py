@@ -49,20 +49,20 @@ def prepared_regions(
     return run
 
 
-def solve_regions(problem: Any, cloud: Any, *, u0: Any = None, **options: Any) -> RegionsSolution:
-    """The solution of a problem with several regions; options as those of :func:`jsmitsm.solve`."""
+def solve_regions(problem: Any, cloud: Any, *, u0: Any = None, **options: Any) -> tuple[RegionsSolution, RegionsRun]:
+    """The solution of a problem with several regions, and its run; options as those of :func:`jsmitsm.solve`."""
     run = prepared_regions(problem, cloud, u0=u0, **options)
     if run.disc.linear:
         values, good = run.step(run.numbers())
-        return finished_regions(run, values, None, good, 1)
-    return finished_regions(run, *newton(run, u0))
+        return finished_regions(run, values, None, good, 1), run
+    return finished_regions(run, *newton(run, u0)), run
 
 
 def finished_regions(run: RegionsRun, values: Any, taylor: Any, good: Any, iterations: Any) -> RegionsSolution:
     """The solution of a run that ended with these values and expansions (None: a linear problem)."""
     disc = run.disc
     run.seconds["total"] = time.perf_counter() - run.began
-    recipe = Recipe("S", disc.rec.order, None, "loo", disc.rec.fields, disc.rec.depth)
+    recipe = Recipe("S", disc.rec.order, None, "loo", disc.rec.fields, disc.rec.depth, tuple(disc.rec.orders))
     fit = RegionsFit(disc.problem, disc.cloud, whole_table(disc), taylor, recipe)
     report = None if is_traced(values) else run
     return RegionsSolution(values, disc.cloud, recipe, fit, good, iterations, run.stats(), report=report)
