@@ -36,13 +36,16 @@ ROWS = [
     {"particle": (0.0, 1.76), "cloud": (1.92, 1.76), "equation": (3.84, 1.76)},
     {"discretization": (0.0, 5.6)},
     {"solution": (0.0, 7.4)},
-    {"tuning": (0.0, 2.36), "modes": (2.52, 2.36), "show": (5.04, 2.36)},
+    {
+        "tuning": (0.0, 1.38), "adaptation": (1.505, 1.38), "evolution": (3.01, 1.38), "modes": (4.515, 1.38),
+        "show": (6.02, 1.38),
+    },
 ]
 BESIDE = {"linear": (5.76, 1.64)}
 COLOURS = {
     "runtime": "#e6e6e6", "taylor": "#e6e6e6", "particle": "#cfe5f5", "cloud": "#cfe5f5", "equation": "#cfe5f5",
-    "discretization": "#fbe3b5", "linear": "#cdebdf", "solution": "#f7d3c1", "tuning": "#f0dbe8", "modes": "#f0dbe8",
-    "show": "#f0dbe8",
+    "discretization": "#fbe3b5", "linear": "#cdebdf", "solution": "#f7d3c1", "tuning": "#f0dbe8",
+    "adaptation": "#f0dbe8", "evolution": "#f0dbe8", "modes": "#f0dbe8", "show": "#f0dbe8",
 }  # fmt: skip
 # What goes from one package to the next on the sheet, and where.
 ARROWS = {
@@ -55,9 +58,11 @@ ARROWS = {
     ("equation", "discretization"): (4.72, "coefficients"),
     ("discretization", "solution"): (2.8, "rows of the global system"),
     ("linear", "solution"): (6.1, "factors"),
-    ("solution", "tuning"): (1.18, "values, estimates"),
-    ("solution", "modes"): (3.7, "local polynomials"),
-    ("solution", "show"): (6.22, "values"),
+    ("solution", "tuning"): (0.69, "estimates"),
+    ("solution", "adaptation"): (2.19, "defects"),
+    ("solution", "evolution"): (3.7, "states"),
+    ("solution", "modes"): (5.2, "polynomials"),
+    ("solution", "show"): (6.71, "values"),
 }
 # Sizes in points, and a line's height in inches.
 NAME, SAID, LISTED, LINE, PAD = 11, 8.2, 7.4, 0.15, 0.09

@@ -7,7 +7,9 @@ import matplotlib
 import numpy as np
 
 import jsmitsm as js
+from benchmarks.adaptation import true_error
 from benchmarks.commandline import arguments
+from benchmarks.nist import CASES as NIST
 from benchmarks.problems import CASES
 
 matplotlib.use("Agg")
@@ -65,6 +67,33 @@ def errors(plt):
     return fig
 
 
+def modes(plt):
+    """Modes of a round drum and of a clamped plate."""
+    fig, axes = plt.subplots(2, 4, figsize=(9.5, 5.2), layout="constrained")
+    disk = js.from_sdf(js.sdf.circle((0.0, 0.0), 1.0), ((-1.1, -1.1), (1.1, 1.1)), 0.07)
+    drum = js.Problem(lambda u, x: -js.laplacian(u)(x), {"boundary": js.dirichlet(0.0)})
+    square = js.rectangle((0, 0), (1, 1), (25, 25))
+    rim = dict.fromkeys(("left", "right", "bottom", "top"), [js.dirichlet(0.0), js.neumann(0.0)])
+    plate = js.Problem(lambda u, x: js.laplacian(js.laplacian(u))(x), rim)
+    for row, (cloud, problem) in zip(axes, ((disk, drum), (square, plate))):
+        found = js.eigen(problem, cloud, 6, order=8)
+        for ax, k in zip(row, (0, 1, 3, 5)):
+            size = float(np.abs(found.u[:, k]).max())
+            js.plot.values(cloud, found.u[:, k] / size, colorbar=False, ax=ax)
+            ax.set_title(f"root of lambda {found.values[k] ** 0.5:.6f}", fontsize="medium")
+            ax.set_axis_off()
+    return fig
+
+
+def adaptation(plt):
+    """A corner singularity to 1e-6, its place unknown."""
+    case = NIST["corner-270"]()
+    found = js.adapt(case.problem, case.make, 1e-6)
+    axes = js.plot.adaptation(found)
+    axes[0].set_title(f"{len(found.cloud)} particles; true error {true_error(case, found):.0e}", fontsize="medium")
+    return axes[0].figure
+
+
 def regions(plt):
     """A disk in a plate, whose contact is imperfect: particles, and a temperature that jumps."""
     disk = js.sdf.circle((0.0, 0.0), 0.5)
@@ -80,7 +109,10 @@ def regions(plt):
     return fig
 
 
-def main(names=("first", "slices", "errors", "regions")):
+PICTURES = ("first", "slices", "errors", "regions", "modes", "adaptation")
+
+
+def main(names=PICTURES):
     import matplotlib.pyplot as plt
 
     IMAGES.mkdir(parents=True, exist_ok=True)
@@ -92,4 +124,4 @@ def main(names=("first", "slices", "errors", "regions")):
 
 
 if __name__ == "__main__":
-    main(arguments(__doc__, names="picture").names or ("first", "slices", "errors", "regions"))
+    main(arguments(__doc__, names="picture").names or PICTURES)

@@ -83,6 +83,8 @@ class Data:
 
     def _look(self, points: np.ndarray, which: np.ndarray, offsets: np.ndarray, length: np.ndarray) -> Look:
         t = self.traced
+        if not len(which):
+            return Look(*np.zeros((4, len(points))))
         jac, source = self.series(points, self.degree)
         jac_there, source_there = self.series(points[which] + offsets, 0)
         powers = np.stack([np.prod(offsets ** np.array(a), axis=1) for a in multi_indices(t.dim, self.degree)])

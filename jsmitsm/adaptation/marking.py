@@ -12,7 +12,7 @@ from jsmitsm.adaptation.spacing_field import GROWTH
 SAFETY = 0.4
 # A spacing changes by at most these factors in a round: refined where the solution is smooth, where it is known not to
 # be, and coarsened: freely where the error says nothing yet, later gently, or rounds would undo each other.
-FINER, SINGULAR, COARSER, GENTLY = 0.3, 0.05, 3.0, 1.25
+FINER, SINGULAR, COARSER, GENTLY = 0.3, 0.05, 3.0, 1.4
 # Where refining helped with less than this part of the expected power, the solution is not smooth.
 _ROUGH = 0.6
 _SLOWEST = 0.35
@@ -22,7 +22,7 @@ _CHANGED, _AROUND = 1.3, 6
 # may be one of its so many neighbours without an equation of its own, as at the corner of a domain.
 _NEAR, _WORST, _HELD = 8, 12, 4
 # The error is at least the largest contribution, and random signs of many add up to this part of their root sum square.
-_SPREAD = 0.25
+_SPREAD = 0.2
 # While the error is larger than this the solution is not resolved, and an estimate of it means little.
 ROUGH = 0.3
 

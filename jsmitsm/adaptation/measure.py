@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm.runtime.errors import SolveError
+from jsmitsm.solution.estimate import Correction
 from jsmitsm.solution.solution import Solution
 from jsmitsm.taylor.multi_indices import multi_indices
 
@@ -34,7 +35,7 @@ def measured(sol: Solution, spacing: np.ndarray, order: int, norm: str, quantity
     values = np.asarray(sol.u).reshape(len(sol.cloud), -1)
     scale = float(np.abs(values).max(initial=0.0))
     try:
-        found = sol.correction()
+        found = _corrected(sol)
         error = np.asarray(found.error)
         fine = np.isfinite(values).all() and np.isfinite(error).all()
     except (ValueError, SolveError):
@@ -55,6 +56,13 @@ def measured(sol: Solution, spacing: np.ndarray, order: int, norm: str, quantity
     if found.adjoint is not None:
         contribution = np.abs(found.adjoint(weights) * np.asarray(found.defect)).max(axis=1)
     return Measured(away, contribution, scale, number)
+
+
+def _corrected(sol: Solution) -> Correction:
+    """What the estimate knows; of several regions the size of the error alone."""
+    if sol.defects:
+        return sol.correction()
+    return Correction(np.asarray(sol.error_estimate()).reshape(len(sol.cloud), -1), None, None)
 
 
 def size(error: np.ndarray, values: np.ndarray, spacing: np.ndarray, norm: str, dim: int) -> float:

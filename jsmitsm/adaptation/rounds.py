@@ -31,6 +31,8 @@ _LADDER = {
 _HOPE = 0.5
 # Polynomials of neighbours may differ between them by so many tolerances.
 _GAP = 10.0
+# A cloud of this part of the particles that are allowed is the last.
+_FULL = 0.8
 # So many solves in a row may fail, each followed by one on a finer cloud.
 _REFUSED = 4
 # A cloud grows at most by this factor, small ones by more; large ones at least by the next.
@@ -132,7 +134,7 @@ class Rounds:
         return solve(self.problem, cloud, order=order, throw=True, **{"depth": depth, **options})
 
     def _operator_order(self, sol: Solution) -> int:
-        return max(sol.operator_orders)
+        return max(sol.operator_orders, default=2)  # several regions do not tell
 
     # ------------------------------------------------------------------ orders
 
@@ -186,7 +188,7 @@ class Rounds:
             return False
         self._checked(sol, cloud, spacing)
         self.flags = sol.flags
-        apart = None if self.quantity is not None or self.norm != "max" else gaps(sol)
+        apart = gaps(sol) if self.quantity is None and self.norm == "max" and sol.defects else None
         self.apart = None
         if apart is not None and apart.max() > _GAP * self.tol * found.scale:
             self.apart = apart
@@ -224,17 +226,19 @@ class Rounds:
         power = self.solution.order + 1.0 + min(0, cloud.dim - self._operator_order(self.solution))
         trusted = len(self.rows) > 1 and self.rows[-2][1] == self.rows[-1][1] and np.isfinite(found.error)
         contribution, error = found.contribution, self.error if np.isfinite(self.error) else 1e3
+        between = self.apart is not None
         if self.apart is not None:
             contribution, error = self.apart, float(self.apart.max()) / found.scale / _GAP
             trusted, self.apart = False, None
         here = marks(points, h, contribution, power, self.before if trusted else None)
         self.before = here if np.isfinite(found.error) else None
-        if len(cloud) >= self.max_particles:
+        if len(cloud) >= _FULL * self.max_particles:
             self._limit(f"the {self.max_particles} particles that were allowed (max_particles)")
             return None
         most = min(max(_GROWTH * len(cloud), _SMALL[cloud.dim]), self.max_particles)
         wanted = self.tol if error > self.tol else 0.5 * error
-        made_h, count = next_spacing(here, power, error, wanted, most)
+        made_h, _ = next_spacing(here, power, error, wanted, most)
+        made_h = np.minimum(made_h, h) if between else made_h
         field = SpacingField(points, made_h, spacing.largest)
         for _ in range(8):
             try:

@@ -22,7 +22,7 @@ from jsmitsm.show import drawing
 from jsmitsm.show.drawing import COLOURS, GREY, MARKERS
 from jsmitsm.solution.solution import Solution
 
-__all__ = ["cloud", "convergence", "error", "estimate", "solution", "sparsity", "tuning", "values"]
+__all__ = ["adaptation", "cloud", "convergence", "error", "estimate", "solution", "sparsity", "tuning", "values"]
 
 
 def cloud(what: Cloud | Solution, *, normals: bool = False, support: int | None = None, kernel: Kernel | None = None,
@@ -31,13 +31,24 @@ def cloud(what: Cloud | Solution, *, normals: bool = False, support: int | None 
 
     Parameters
     ----------
-    what : a :class:`jsmitsm.Cloud` or a :class:`jsmitsm.Solution`, whose cloud is taken.
-    normals : draw the boundary's normals.
-    support : a particle whose support is shown: its neighbours are ringed, and with ``kernel`` the
-        ball |x - x_i| <= d h is drawn.
-    kernel, stencils : where the support comes from; a Solution brings its own neighbours.
-    legend : name the groups and count their particles.
-    ax : axes to draw on; in 3D they need ``projection="3d"``.
+    what : Cloud or Solution
+        A ``js.Cloud`` or a ``js.Solution``, whose cloud is taken.
+    normals : bool
+        Draw the boundary's normals.
+    support : int, optional
+        A particle whose support is shown: its neighbours are ringed, and with ``kernel`` the ball |x - x_i| <= d h
+        is drawn.
+    kernel, stencils : Kernel, Stencils, optional
+        Where the support comes from; a Solution brings its own neighbours.
+    legend : bool
+        Name the groups and count their particles.
+    ax : Axes, optional
+        Axes to draw on; in 3D they need ``projection="3d"``.
+
+    Returns
+    -------
+    Axes
+        What it was drawn on.
 
     Raises
     ------
@@ -89,22 +100,30 @@ def solution(sol: Solution, *, field: int = 0, exact: Any = None, at: Mapping[st
 
     Parameters
     ----------
-    sol : a :class:`jsmitsm.Solution`.
-    field : the field of a system.
-    exact : 1D only: the exact solution to draw beside it, a function of one point x (1,).
-    at : 3D only: positions of the slices by axis, ``{"z": 0.5}``; the middle of every axis if not given.
-    levels : about how many contour levels.
-    colorbar : draw one, for 2D and 3D.
-    ax : axes; in 3D one for every slice.
+    sol : Solution
+        A ``js.Solution``.
+    field : int
+        The field of a system.
+    exact : function, optional
+        1D only: the exact solution to draw beside it, a function of one point x (1,).
+    at : mapping, optional
+        3D only: positions of the slices by axis, ``{"z": 0.5}``; the middle of every axis if not given.
+    levels : int
+        About how many contour levels.
+    colorbar : bool
+        Draw one, for 2D and 3D.
+    ax : Axes or array of Axes, optional
+        Axes; in 3D one for every slice.
+
+    Returns
+    -------
+    Axes or array of Axes
+        In 3D an array, one per slice.
 
     Raises
     ------
     ValueError
         For a field, a slice or a number of axes that does not fit.
-
-    Returns
-    -------
-    The axes; in 3D an array of them, one per slice.
 
     Examples
     --------
@@ -152,8 +171,30 @@ def _regions(cloud: Cloud) -> list[tuple[Cloud, dict[str, str]]]:
 
 def values(cloud: Cloud, numbers: Any, *, log: bool = False, label: str = "", at: Mapping[str, float] | None = None,
            levels: int = 20, colorbar: bool = True, ax: Any = None) -> Any:  # fmt: skip
-    """Any numbers (N,) at the particles as a map; ``log`` for a logarithmic scale. ``at``, ``levels``,
-    ``colorbar`` and ``ax`` as in :func:`solution`. Raises ValueError unless ``numbers`` are (N,) and finite.
+    """Any numbers at the particles as a map.
+
+    Parameters
+    ----------
+    cloud : Cloud
+        The particles.
+    numbers : array_like (N,)
+        One for each, finite.
+    log : bool
+        A logarithmic scale.
+    label : str
+        What the numbers are.
+    at, levels, colorbar, ax : optional
+        As in ``js.plot.solution``.
+
+    Returns
+    -------
+    Axes or array of Axes
+        In 3D an array, one per slice.
+
+    Raises
+    ------
+    ValueError
+        Unless ``numbers`` are (N,) and finite.
 
     Examples
     --------
@@ -182,10 +223,28 @@ def values(cloud: Cloud, numbers: Any, *, log: bool = False, label: str = "", at
 
 
 def error(sol: Solution, exact: Any, *, field: int = 0, log: bool = True, ax: Any = None, **options: Any) -> Any:
-    """The error |u - exact| at the particles; ``exact`` is an array (N,) or a function of one point x (D,).
+    """The error |u - exact| at the particles.
 
-    ``sol`` and ``field`` as in :func:`solution`, ``log`` and ``options`` go to :func:`values`. Raises ValueError for
-    an exact solution of another size.
+    Parameters
+    ----------
+    sol : Solution
+        Whose error.
+    exact : array_like (N,) or function
+        The exact values, or a function of one point x (D,).
+    field : int
+        The field of a system.
+    log, ax, **options : optional
+        As in ``js.plot.values``.
+
+    Returns
+    -------
+    Axes or array of Axes
+        In 3D an array, one per slice.
+
+    Raises
+    ------
+    ValueError
+        For an exact solution of another size.
 
     Examples
     --------
@@ -205,9 +264,21 @@ def error(sol: Solution, exact: Any, *, field: int = 0, log: bool = True, ax: An
 
 
 def estimate(sol: Solution, *, field: int = 0, log: bool = True, ax: Any = None, **options: Any) -> Any:
-    """The estimated error of a solution at the particles, :meth:`jsmitsm.Solution.error_estimate`, as a map.
+    """The estimated error at the particles, ``js.Solution.error_estimate``, as a map.
 
-    ``sol`` and ``field`` as in :func:`solution`, ``log``, ``ax`` and ``options`` go to :func:`values`.
+    Parameters
+    ----------
+    sol : Solution
+        Whose error.
+    field : int
+        The field of a system.
+    log, ax, **options : optional
+        As in ``js.plot.values``.
+
+    Returns
+    -------
+    Axes or array of Axes
+        In 3D an array, one per slice.
 
     Examples
     --------
@@ -224,7 +295,17 @@ def estimate(sol: Solution, *, field: int = 0, log: bool = True, ax: Any = None,
 def sparsity(what: Any, *, ax: Any = None) -> Any:
     """Which particles each particle looks at, as a matrix: row i has a dot for every neighbour of particle i.
 
-    ``what``: :class:`jsmitsm.Stencils`, a :class:`jsmitsm.Solution`, or a matrix (scipy.sparse or an array).
+    Parameters
+    ----------
+    what : Stencils, Solution, matrix or array
+        A matrix of scipy.sparse will do.
+    ax : Axes, optional
+        Where to draw.
+
+    Returns
+    -------
+    Axes
+        What it was drawn on.
 
     Examples
     --------
@@ -256,10 +337,25 @@ def sparsity(what: Any, *, ax: Any = None) -> Any:
 def tuning(result: Any, *, ax: Any = None) -> Any:
     """The history of a tuning: the objective and every parameter over the steps.
 
-    ``result``: what :func:`jsmitsm.tune` returned, or its ``history``: a mapping from ``"objective"`` and the
-    parameters' names to one entry per step, or a pytree of such. A parameter with one number per particle is
-    drawn as its median and its range. ``ax``: as many axes as there are panels. Returns an array of them. Raises
-    ValueError for a history without ``"objective"``.
+    A parameter with one number per particle is drawn as its median and its range.
+
+    Parameters
+    ----------
+    result : TuneResult or mapping
+        What ``js.tune`` returned, or its ``history``: from ``"objective"`` and the parameters' names to one entry
+        per step, or a pytree of such.
+    ax : array of Axes, optional
+        As many as there are panels.
+
+    Returns
+    -------
+    array of Axes
+        One per panel.
+
+    Raises
+    ------
+    ValueError
+        For a history without ``"objective"``.
 
     Examples
     --------
@@ -302,11 +398,22 @@ def convergence(spacing: Any, errors: Any, *, floor: float = 1e-13, xlabel: str 
 
     Parameters
     ----------
-    spacing : (M,) distances between particles, in any order.
-    errors : (M,) errors, or a mapping from a name to them for several lines.
-    floor : errors below it are round-off and take no part in the order, which is the slope of the
-        least-squares line through the others.
-    xlabel, ylabel : names of the axes.
+    spacing : array_like (M,)
+        (M,) distances between particles, in any order.
+    errors : array_like (M,) or mapping
+        (M,) errors, or a mapping from a name to them for several lines.
+    floor : float
+        Errors below it are round-off and take no part in the order, which is the slope of the least-squares line
+        through the others.
+    xlabel, ylabel : str
+        Names of the axes.
+    ax : Axes, optional
+        Where to draw.
+
+    Returns
+    -------
+    Axes
+        What it was drawn on.
 
     Raises
     ------
@@ -345,3 +452,54 @@ def convergence(spacing: Any, errors: Any, *, floor: float = 1e-13, xlabel: str 
         ax.legend(frameon=False, fontsize="small")
     drawing.labels(ax, xlabel, ylabel)
     return ax
+
+
+def adaptation(found: Any, *, ax: Any = None) -> np.ndarray:
+    """What :func:`jsmitsm.adapt` did, in three panels: spacings, the estimated error, and the rounds.
+
+    Spacings are distances to the nearest particle, as colours of the particles in 2D, else against x or, in 3D, against
+    the distance from the finest place; a round is a dot with its order.
+
+    ``found``: a :class:`jsmitsm.Adapted`. ``ax``: three axes. Returns them. Raises ValueError for anything else.
+
+    Examples
+    --------
+    >>> import jax; jax.config.update("jax_enable_x64", True)
+    >>> import jsmitsm as js
+    >>> ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(1.0)}
+    >>> problem = js.Problem(lambda u, x: js.laplacian(u)(x) - 2.0, ends)
+    >>> axes = js.plot.adaptation(js.adapt(problem, lambda spacing: js.interval(0.0, 1.0, spacing=spacing), 1e-4))
+    """
+    if not all(hasattr(found, name) for name in ("solution", "cloud", "history", "tol")):
+        raise ValueError(f"found: expected what js.adapt returned, got {type(found).__name__}")
+    from scipy.spatial import cKDTree
+
+    shown: Cloud = found.cloud
+    axes = drawing.panels(ax, 3, (4.6, 3.8))
+    points = np.asarray(shown.points)
+    gap = cKDTree(points).query(points, k=2)[0][:, 1]
+    error_ = np.abs(np.asarray(found.solution.error_estimate())).reshape(len(points), -1).max(axis=1)
+    error_ = np.maximum(error_, drawing.floor(error_))
+    if shown.dim == 2:
+        scale = {"norm": "log", "s": np.clip(12000.0 / len(points), 1, 25), "linewidths": 0}
+        for one, numbers, cmap, name in ((axes[0], gap, "viridis", "spacing"), (axes[1], error_, "cividis", "error")):
+            dots = one.scatter(*points.T, c=numbers, cmap=cmap, **scale)
+            one.figure.colorbar(dots, ax=one, label="estimated error" if name == "error" else name)
+            drawing.dress(one, 2)
+    else:
+        place = points[:, 0] if shown.dim == 1 else np.linalg.norm(points - points[np.argmin(gap)], axis=1)
+        order = np.argsort(place)
+        for one, numbers, name in ((axes[0], gap, "spacing"), (axes[1], error_, "estimated error")):
+            one.semilogy(place[order], numbers[order], ".", color=COLOURS[1], markersize=3)
+            drawing.labels(one, "x" if shown.dim == 1 else "distance from the finest place", name)
+    axes[0].set_title(f"{len(points)} particles", fontsize="medium")
+    history = found.history
+    error_ = np.where(np.isfinite(history["error"]), history["error"], np.nan)
+    axes[2].loglog(history["particles"], error_, ".-", color=COLOURS[4], markersize=9)
+    axes[2].axhline(found.tol, color="k", linewidth=0.8, linestyle="--")
+    for n, e, p in zip(history["particles"], error_, history["order"]):
+        axes[2].annotate(str(p), (n, e), xytext=(4, 4), textcoords="offset points", fontsize="small")
+    axes[2].set_title("tolerance dashed, orders written", fontsize="medium")
+    drawing.decades(axes[2].xaxis)
+    drawing.labels(axes[2], "particles", "estimated relative error")
+    return axes

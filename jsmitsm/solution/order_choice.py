@@ -28,17 +28,16 @@ def check_tolerance(order: Any, tol: Any) -> None:
         raise ValueError(f'tol: got {short(tol)} with order={short(order)}; a tolerance goes with order="auto"')
 
 
-def of_tolerance(solved: Callable[[int], tuple[Solution, Any]], tol: float) -> Solution:
+def of_tolerance(solved: Callable[[int], Solution], tol: float) -> Solution:
     """The solution of the lowest order whose estimated error is within ``tol`` of the largest \\|u\\|.
 
-    solved: of an order, the solution and its run. Where no order reaches the tolerance, the best solution, with a flag
-    that says so.
+    solved: of an order, the solution. Where no order reaches the tolerance, the best one, with a flag that says so.
     """
-    best: tuple[float, Solution, Any] | None = None
+    best: tuple[float, Solution] | None = None
     idle, refused = 0, None
     for order in ORDERS:
         try:
-            sol, run = solved(order)
+            sol = solved(order)
             if is_traced(sol.u):
                 raise ValueError(
                     'order: "auto" compares estimates, which JAX traces here; choose the order before the transform'
@@ -55,17 +54,16 @@ def of_tolerance(solved: Callable[[int], tuple[Solution, Any]], tol: float) -> S
             return sol
         idle = idle + 1 if best is not None and not error < _GAIN * best[0] else 0
         if best is None or error < best[0]:
-            best = error, sol, run
+            best = error, sol
         if idle == _IDLE:
             break
     assert best is not None
-    error, sol, run = best
+    error, sol = best
     why = f"; order {order} was refused: {refused}" if refused is not None else ""
-    run.object(
+    sol.stats["objections"] = [
         f"No order reaches the tolerance {tol:.1e} on this cloud: the best, {sol.order}, has an estimated error of "
         f"{error:.1e} of the largest value; take a finer cloud, or js.adapt{why}."
-    )
-    sol.stats["messages"] = list(run.messages)
+    ]
     return sol
 
 

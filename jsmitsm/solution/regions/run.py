@@ -35,7 +35,7 @@ from jsmitsm.solution.run import Run
 
 
 class RegionsRun(Run):
-    """What :class:`Run` is to a problem of one region; ``disc`` is a :class:`Regions`."""
+    """What ``Run`` is to a problem of one region; ``disc`` is a ``Regions``."""
 
     disc: Any
     nums: Any

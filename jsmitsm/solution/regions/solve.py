@@ -49,13 +49,13 @@ def prepared_regions(
     return run
 
 
-def solve_regions(problem: Any, cloud: Any, *, u0: Any = None, **options: Any) -> tuple[RegionsSolution, RegionsRun]:
-    """The solution of a problem with several regions, and its run; options as those of :func:`jsmitsm.solve`."""
+def solve_regions(problem: Any, cloud: Any, *, u0: Any = None, **options: Any) -> RegionsSolution:
+    """The solution of a problem with several regions; options as those of ``js.solve``."""
     run = prepared_regions(problem, cloud, u0=u0, **options)
     if run.disc.linear:
         values, good = run.step(run.numbers())
-        return finished_regions(run, values, None, good, 1), run
-    return finished_regions(run, *newton(run, u0)), run
+        return finished_regions(run, values, None, good, 1)
+    return finished_regions(run, *newton(run, u0))
 
 
 def finished_regions(run: RegionsRun, values: Any, taylor: Any, good: Any, iterations: Any) -> RegionsSolution:

@@ -1,0 +1,213 @@
+"""A tolerance in, an answer out: what is reached is so, what is not is said."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jsmitsm as js
+from jsmitsm.adaptation.data import data_of, unresolved
+from jsmitsm.adaptation.first_cloud import first_cloud
+from jsmitsm.adaptation.layers import layers
+from jsmitsm.adaptation.marking import Marks, next_spacing
+from jsmitsm.adaptation.spacing_field import GROWTH, SpacingField
+
+CORNER = [(0, 0), (1, 0), (1, 1), (-1, 1), (-1, -1), (0, -1)]
+SQUARE = [(0, 0), (1, 0), (1, 1), (0, 1)]
+
+
+def line(spacing):
+    return js.interval(0.0, 1.0, spacing=spacing)
+
+
+def ends(left, right):
+    return {"left": js.dirichlet(left), "right": js.dirichlet(right)}
+
+
+def true_error(found, exact):
+    known = np.asarray(jax.vmap(exact)(np.asarray(found.cloud.points)))
+    return float(np.abs(np.asarray(found.solution.u) - known).max() / np.abs(known).max())
+
+
+def singular(x):
+    """r^(2/3) sin(2 t / 3), harmonic, with an infinite slope at the corner."""
+    square = x[0] ** 2 + x[1] ** 2
+    safe = jnp.where(square == 0, 1.0, square)
+    angle = jnp.arctan2(x[1], jnp.where(square == 0, 1.0, x[0]))
+    angle = jnp.where(angle < -1e-9, angle + 2 * jnp.pi, angle)
+    return jnp.where(square == 0, 0.0, safe ** (1 / 3) * jnp.sin(2 / 3 * angle))
+
+
+@pytest.fixture(scope="module")
+def cornered():
+    problem = js.Problem(lambda u, x: js.laplacian(u)(x), {"boundary": js.dirichlet(singular)})
+    return js.adapt(problem, lambda spacing: js.from_polygon(CORNER, spacing), 2e-3, order=4)
+
+
+def test_a_corner_is_found_by_the_estimate_alone(cornered):
+    assert cornered.reached and cornered.error <= 2e-3 and not cornered.flags
+    true = true_error(cornered, singular)
+    assert true <= 3 * 2e-3  # what "reached" promises
+    assert true / 5 <= cornered.error <= 20 * true  # near a corner the check by another order is on the safe side
+    points = np.asarray(cornered.cloud.points)
+    finest = np.argsort(np.linalg.norm(points[:, None] - points[None], axis=2) + 9 * np.eye(len(points)), axis=1)[:, 0]
+    gap = np.linalg.norm(points - points[finest], axis=1)
+    assert np.linalg.norm(points[np.argmin(gap)]) < 0.05  # the corner is the origin
+    assert gap.max() > 10 * gap.min()
+
+
+def test_the_history_has_every_round(cornered):
+    history = cornered.history
+    assert set(history) == {"particles", "order", "error", "seconds", "smallest"}
+    assert len({len(column) for column in history.values()}) == 1
+    assert history["particles"][-1] == len(cornered.cloud) and (history["order"] == 4).all()
+    assert history["smallest"][-1] < history["smallest"][0] and (history["seconds"] > 0).all()
+    assert "reached=True" in repr(cornered) and "Adapted(" in cornered.diagnose()
+
+
+def test_a_gradient_passes_through_the_final_cloud(cornered):
+    cloud, near = cornered.cloud, js.stencils(cornered.cloud, size=20)
+
+    def middle(q):
+        problem = js.Problem(lambda u, x: js.laplacian(u)(x) + q, {"boundary": js.dirichlet(0.0)})
+        return js.solve(problem, cloud, order=4, stencils=near).u.max()
+
+    # The problem is linear in q: the slope is the value at q = 1.
+    assert float(jax.grad(middle)(2.0)) == pytest.approx(float(middle(1.0)), rel=1e-9)
+
+
+def test_layers_at_both_ends_are_told_by_the_coefficients():
+    """-eps^2 u'' + u = 0 with u = 1 at the ends: within the first spacing no particle sees anything but zero."""
+    eps = 1e-4
+    problem = js.Problem(lambda u, x: u(x) - eps**2 * js.laplacian(u)(x), ends(1.0, 1.0))
+    found = js.adapt(problem, line, 1e-4, order=4)
+    exact = lambda x: jnp.exp(-x[0] / eps) + jnp.exp((x[0] - 1.0) / eps)
+    assert found.reached and true_error(found, exact) <= 3e-4
+    # Between the particles too.
+    at = np.linspace(0.0, 10 * eps, 201)[:, None]
+    assert np.abs(np.asarray(found.solution(at)) - np.exp(-at[:, 0] / eps)).max() < 3e-3
+
+
+def test_a_nonlinear_problem_and_its_quantity():
+    """u'' = 6 u^2 has the solution (1 + x)^-2; its slope at the right end is -2 / 8."""
+    problem = js.Problem(lambda u, x: js.laplacian(u)(x) - 6.0 * u(x) ** 2, ends(1.0, 0.25))
+    found = js.adapt(problem, line, 1e-6, order=4, quantity=lambda sol: sol.flux("right"))
+    assert found.reached
+    assert abs(found.quantity + 0.25) <= 3e-6 * 0.25
+    assert found.error <= 1e-6
+
+
+def test_the_tolerance_is_on_the_number():
+    """A point value of u'' = -pi^2 sin(pi x) to a tolerance that the first cloud does not meet."""
+    problem = js.Problem(lambda u, x: js.laplacian(u)(x) + jnp.pi**2 * jnp.sin(jnp.pi * x[0]), ends(0.0, 0.0))
+    found = js.adapt(problem, line, 1e-4, order=2, start=0.1, depth=0, quantity=lambda sol: sol(np.array([[0.3]]))[0])
+    away = abs(found.quantity - np.sin(0.3 * np.pi)) / np.sin(0.3 * np.pi)
+    assert len(found.history["particles"]) > 1
+    assert found.reached and away <= 3e-4
+
+
+def test_what_limits_is_said():
+    problem = js.Problem(lambda u, x: js.laplacian(u)(x) + jnp.sin(40.0 * x[0]), ends(0.0, 0.0))
+    few = js.adapt(problem, line, 1e-10, order=2, depth=0, max_particles=40)
+    assert not few.reached and few.error > 1e-10 and len(few.cloud) <= 40
+    assert any("max_particles" in line for line in few.messages)
+    short = js.adapt(problem, line, 1e-10, order=2, depth=0, max_rounds=1)
+    assert not short.reached and any("max_rounds" in line for line in short.messages)
+
+
+# ------------------------------------------------------------------ what is known before a solve
+
+
+def test_a_peak_between_the_particles_is_seen():
+    peak = lambda x: jnp.exp(-1e5 * ((x[0] - 0.51) ** 2 + (x[1] - 0.117) ** 2))
+    problem = js.Problem(lambda u, x: js.laplacian(u)(x) - 1e5 * peak(x), {"boundary": js.dirichlet(0.0)})
+    cloud = js.from_polygon(SQUARE, 0.1)
+    points, width = unresolved(data_of(problem, 2, 4), cloud, 0.1, 0.05, 1.0, 100_000)
+    finest = points[width == width.min()]
+    assert width.min() < 2e-3  # its width is 3e-3
+    assert np.linalg.norm(finest - [0.51, 0.117], axis=1).max() < 0.02
+
+
+def test_a_smooth_source_asks_for_nothing():
+    problem = js.Problem(lambda u, x: js.laplacian(u)(x) - jnp.exp(x[0] * x[1]), {"boundary": js.dirichlet(0.0)})
+    points, _ = unresolved(data_of(problem, 2, 4), js.from_polygon(SQUARE, 0.1), 0.1, 0.05, 1.0, 100_000)
+    assert not len(points)
+
+
+def test_outflow_has_a_layer_and_inflow_none():
+    problem = js.Problem(lambda u, x: -1e-3 * js.laplacian(u)(x) + js.grad(u)(x)[0] - 1.0, ends(0.0, 0.0))
+    at, spacing = layers(data_of(problem, 1, 4), js.interval(0.0, 1.0, 11), np.full(11, 0.1))
+    assert at.tolist() == [[1.0]]
+    assert spacing == pytest.approx([1e-3])
+
+
+def test_the_first_cloud_suits_any_size_of_domain():
+    for size in (1e-3, 1.0, 1e4):
+        cloud, _ = first_cloud(lambda spacing: js.from_polygon(np.multiply(SQUARE, size), spacing), None)  # noqa: B023
+        assert 100 <= len(cloud) <= 400
+
+
+# ------------------------------------------------------------------ spacings
+
+
+def test_a_spacing_field_grows_no_faster_than_it_may():
+    rng = np.random.default_rng(0)
+    points = rng.uniform(size=(300, 2))
+    wanted = np.where(np.arange(300) == 7, 1e-4, 0.2)
+    field = SpacingField(points, wanted, 0.2)
+    away = np.linalg.norm(points - points[7], axis=1)
+    # From neighbour to neighbour a way is longer than straight, by up to a half here; at a point it is the own one.
+    assert (field(points) <= np.minimum(0.2, 1e-4 + GROWTH * 2.0 * away) + 1e-12).all()
+    assert field(points[7:8]) == pytest.approx([1e-4])
+    assert field(np.array([[9.0, 9.0]])) <= 0.2
+
+
+def test_contributions_are_made_equal():
+    """Of two halves whose contributions differ by 2^5, at a rate of 5 the worse one gets half the spacing."""
+    points = np.linspace(0.0, 1.0, 100)[:, None]
+    eta = np.where(points[:, 0] < 0.5, 1.0, 2.0**-5)
+    marks = Marks(points, np.full(100, 0.01), eta, np.full(100, 5.0), np.zeros(100, bool))
+    made, count = next_spacing(marks, 5.0, 1e-2, 2e-3, 100_000)
+    assert made[0] < made[-1]
+    assert made[-1] / made[0] == pytest.approx(2.0, rel=1e-6) or made[-1] == pytest.approx(0.0125)
+    assert next_spacing(marks, 5.0, 1e-2, 1e-12, 150)[1] <= 150
+
+
+# ------------------------------------------------------------------ bad input
+
+
+GOOD = js.Problem(lambda u, x: js.laplacian(u)(x) - 1.0, {"left": js.dirichlet(0.0), "right": js.dirichlet(0.0)})
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"problem": 3}, "problem: expected a js.Problem, got int"),
+        ({"make": 0.1}, "make: expected a function spacing -> js.Cloud, got float"),
+        ({"make": lambda spacing: 3}, "make: returned int, expected a js.Cloud"),
+        ({"make": lambda spacing: js.interval(0.0, 1.0, "x")}, "n: expected"),
+        ({"tol": 0.0}, "tol: expected a relative error between 0 and 1"),
+        ({"tol": "small"}, "tol: expected a relative error between 0 and 1"),
+        ({"order": 13}, "order: 13 leaves no higher one"),
+        ({"order": "best"}, 'order: expected "auto" or a whole number'),
+        ({"start": -1.0}, "start: expected a positive spacing or a function"),
+        ({"quantity": 3.0}, "quantity: expected a function of a Solution"),
+        ({"norm": "maxx"}, "norm: 'maxx' is none of 'max', 'l2'"),
+        ({"max_rounds": 0}, "max_rounds: expected a whole number from 1"),
+        ({"max_particles": 2.5}, "max_particles: expected a whole number from 1"),
+        ({"stencils": None}, "stencils: belongs to one cloud"),
+        ({"throw": False}, "throw: js.adapt refines where a solve fails"),
+        ({"formulaton": "loo"}, "formulaton: no argument of js.adapt or js.solve"),
+        ({"u0": np.zeros(3)}, "u0: expected a function of x"),
+    ],
+)
+def test_bad_input_is_told(change, said):
+    given = {"problem": GOOD, "make": line, "tol": 1e-3, **change}
+    with pytest.raises(ValueError) as told:
+        js.adapt(given.pop("problem"), given.pop("make"), given.pop("tol"), **given)
+    assert said in str(told.value)
+
+
+def test_a_maker_that_never_asks_must_be_told_how_to_begin():
+    with pytest.raises(ValueError, match="never asked for the spacing"):
+        js.adapt(GOOD, lambda spacing: js.interval(0.0, 1.0, 9), 1e-3)
