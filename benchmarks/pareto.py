@@ -2,7 +2,7 @@
 
 Every method and order of the package, and other discretisations where they are installed
 (``pip install ".[bench]"``; updes, which brings Gmsh and pandas along, by ``pip install updes``), on
-four scenes. ``--only=updes`` runs the contestants of that name and keeps the data of the others.
+five scenes. ``--only=updes`` runs the contestants of that name and keeps the data of the others.
 Seconds are from arrays to values: neighbours, weights, assembly, solve. The first call, which
 compiles, stands apart from the median of the repeats; every repeat has its particles moved by a
 trifle, so that no factor is used again. The package differentiates its sources itself; the others
@@ -81,7 +81,7 @@ def _ball(n: int) -> js.Cloud:
 
 SPACINGS = (0.16, 0.13, 0.1, 0.08, 0.06, 0.042, 0.028, 0.02, 0.0137, 0.0092, 0.0061)
 LATTICES = ((9, 19), (17, 37), (25, 55), (33, 73), (49, 109), (65, 145), (129, 289), (257, 577))
-AMOEBA, CONDUCTOR = CASES["amoeba"], CASES["conducting amoeba"]
+AMOEBA, CONDUCTOR, WAVES = CASES["amoeba"], CASES["conducting amoeba"], CASES["oscillating disk"]
 # Its source by AD as in the others.
 LATTICE = replace(CASES["source"], source=None)
 SCENES = {
@@ -94,6 +94,8 @@ SCENES = {
               (500, 1000, 2000, 4000, 8000, 16000, 32000), (2, 4, 6), _ball),
         Scene("conductor", "div(k grad u) = f, k variable, scattered particles", CONDUCTOR, conducting, SPACINGS,
               (2, 4, 6, 8, 10), CONDUCTOR.cloud),
+        Scene("waves", "Poisson, an oscillating source, scattered particles", WAVES, one, SPACINGS, (2, 4, 6, 8, 10),
+              WAVES.cloud),
     )
 }  # fmt: skip
 

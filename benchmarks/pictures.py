@@ -67,6 +67,24 @@ def errors(plt):
     return fig
 
 
+def modes(plt):
+    """Modes of a round drum and of a clamped plate."""
+    fig, axes = plt.subplots(2, 4, figsize=(9.5, 5.2), layout="constrained")
+    disk = js.from_sdf(js.sdf.circle((0.0, 0.0), 1.0), ((-1.1, -1.1), (1.1, 1.1)), 0.07)
+    drum = js.Problem(lambda u, x: -js.laplacian(u)(x), {"boundary": js.dirichlet(0.0)})
+    square = js.rectangle((0, 0), (1, 1), (25, 25))
+    rim = dict.fromkeys(("left", "right", "bottom", "top"), [js.dirichlet(0.0), js.neumann(0.0)])
+    plate = js.Problem(lambda u, x: js.laplacian(js.laplacian(u))(x), rim)
+    for row, (cloud, problem) in zip(axes, ((disk, drum), (square, plate))):
+        found = js.eigen(problem, cloud, 6, order=8)
+        for ax, k in zip(row, (0, 1, 3, 5)):
+            size = float(np.abs(found.u[:, k]).max())
+            js.plot.values(cloud, found.u[:, k] / size, colorbar=False, ax=ax)
+            ax.set_title(f"root of lambda {found.values[k] ** 0.5:.6f}", fontsize="medium")
+            ax.set_axis_off()
+    return fig
+
+
 def adaptation(plt):
     """A corner singularity to 1e-6, its place unknown."""
     case = NIST["corner-270"]()
@@ -91,7 +109,7 @@ def regions(plt):
     return fig
 
 
-PICTURES = ("first", "slices", "errors", "regions", "adaptation")
+PICTURES = ("first", "slices", "errors", "regions", "modes", "adaptation")
 
 
 def main(names=PICTURES):

@@ -138,6 +138,11 @@ def amoeba(spacing: float = 0.027) -> js.Cloud:
     return js.from_sdf(amoeba_level, ((-1.3, -1.3), (1.3, 1.3)), spacing)
 
 
+def disk(spacing: float = 0.05) -> js.Cloud:
+    """The unit disk."""
+    return js.from_sdf(js.sdf.circle((0.0, 0.0), 1.0), ((-1.1, -1.1), (1.1, 1.1)), spacing)
+
+
 def amoeba_level(x: Any) -> Any:
     return jnp.sqrt(x[0] ** 2 + x[1] ** 2 + 1e-300) - 1 - 0.2 * jnp.cos(5 * jnp.arctan2(x[1], x[0]))
 

@@ -1,7 +1,11 @@
 """Meshless solutions of boundary-value problems by local Taylor expansions, in JAX."""
 
+import sys
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
+
+if sys.version_info < (3, 11):  # noqa: UP036  # of a copy that pip did not put there
+    raise ImportError(f"jsmitsm needs Python 3.11 or newer, this is {sys.version.split()[0]}: take another interpreter")
 
 from jsmitsm.cloud.cloud import Cloud, box, rectangle
 from jsmitsm.cloud.line.interval import interval

@@ -125,7 +125,7 @@ def test_a_solution_is_a_pytree(solution):
 
 
 def test_what_a_solution_holds(solution):
-    n, k = len(CLOUD), len(js.multi_indices(1, 4))
+    n, k = len(CLOUD), len(js.multi_indices(1, 4 + solution.stats["depth"]))
     assert solution.u.shape == (n,) and solution.coefficients.shape == (n, k)
     points = np.array([[0.1], [0.2], [0.3]])
     assert solution(points).shape == (3,) and solution.grad(points).shape == (3, 1)

@@ -20,7 +20,7 @@ PYRIGHT = Path(sys.executable).parent / "pyright"
 
 def test_checkers_and_python_are_told_the_same_of_the_lazy_names():
     tree = ast.parse(Path(js.__file__).read_text())
-    told = next(node for node in tree.body if isinstance(node, ast.If)).body
+    (told,) = (n.body for n in tree.body if isinstance(n, ast.If) and ast.unparse(n.test) == "TYPE_CHECKING")
     names = {alias.name: node.module for node in told for alias in node.names}
     assert set(names) == set(js._LAZY)
     for name, module in names.items():

@@ -34,6 +34,10 @@ def _in_3d(x):
     return jnp.exp(0.5 * x[0]) * jnp.sin(x[1] + 0.3) * jnp.cos(x[2])
 
 
+def _oscillating(x: Any) -> Any:
+    return jnp.sin(30.0 * x[0] + 0.3) * jnp.cos(24.0 * x[1])
+
+
 def conducting(x):
     return 1.5 + jnp.sin(2 * x[0] + x[1])
 
@@ -107,6 +111,8 @@ SHAPES = table(
         "conducting amoeba", "div((1.5 + sin(2x + y)) grad u) = f", diffusion(conducting), curved,
         scenes.amoeba, ("boundary",), ceilings={4: 1e-7},
     ),
+    Case("oscillating disk", "laplacian(u) = f, u = sin(30 x + 0.3) cos(24 y)", laplace, _oscillating, scenes.disk,
+         ("boundary",)),
     Case("smooth ball", "laplacian(u) = f in 3D, u smoother than in the ball", laplace, _in_3d, scenes.ball,
          ("sphere",), ceilings={4: 1e-6}),
     Case("two holes", "laplacian(u) = f on a plate with two holes", laplace, _on_plate, scenes.two_holes,

@@ -23,7 +23,7 @@ from jsmitsm.solution.solution import Solution
 
 
 class AdaptOptions(TypedDict, total=False):
-    """Options of :func:`jsmitsm.solve` for every solve of the search."""
+    """Options of ``js.solve`` for every solve of the search."""
 
     method: Method
     depth: Depth
@@ -38,18 +38,35 @@ OPTIONS = tuple(AdaptOptions.__annotations__)
 
 @dataclass
 class Adapted:
-    """What :func:`adapt` found.
+    """What ``js.adapt`` found.
 
     Attributes
     ----------
-    solution, cloud : the last solution and its cloud.
-    error : its estimated error in the measure of the tolerance, relative to the largest \\|u\\|, or to the quantity.
-    reached : whether that is within the tolerance, another order confirms it, and nothing speaks against the solution.
-    tol : what was asked for.
-    history : of every round, ready to plot: ``"particles"``, ``"order"``, ``"error"``, ``"seconds"``, ``"smallest"``
-        (the smallest spacing).
-    quantity : the number that was asked for, None without one.
-    flags : what speaks against the solution, in sentences; :meth:`diagnose` tells what limited the search besides.
+    solution, cloud : Solution, Cloud
+        The last solution and its cloud.
+    error : float
+        Its estimated error in the measure of the tolerance, relative to the largest |u|, or to the quantity.
+    reached : bool
+        Whether that is within the tolerance, another order confirms it, and nothing speaks against the solution.
+    tol : float
+        What was asked for.
+    history : dict
+        Of every round, ready to plot: ``"particles"``, ``"order"``, ``"error"``, ``"seconds"``, ``"smallest"`` (the
+        smallest spacing).
+    quantity : float, optional
+        The number that was asked for, None without one.
+    flags : list of str
+        What speaks against the solution, in sentences; ``diagnose`` tells what limited the search besides.
+
+    Examples
+    --------
+    >>> import jax; jax.config.update("jax_enable_x64", True)
+    >>> import jsmitsm as js
+    >>> ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(0.0)}
+    >>> problem = js.Problem(lambda u, x: js.laplacian(u)(x) + 1.0, ends)
+    >>> found = js.adapt(problem, lambda spacing: js.interval(0.0, 1.0, spacing=spacing), 1e-6)
+    >>> found.reached, found.flags
+    (True, [])
     """
 
     solution: Solution
@@ -63,7 +80,23 @@ class Adapted:
     messages: list[str] = field(default_factory=list)
 
     def diagnose(self) -> str:
-        """In words: how it went, what limited it, and what the solution says of itself."""
+        """In words: how it went, what limited it, and what the solution says of itself.
+
+        Returns
+        -------
+        str
+            Several lines; those that begin with FLAG speak against the solution.
+
+        Examples
+        --------
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import jsmitsm as js
+        >>> ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(0.0)}
+        >>> problem = js.Problem(lambda u, x: js.laplacian(u)(x) + 1.0, ends)
+        >>> found = js.adapt(problem, lambda spacing: js.interval(0.0, 1.0, spacing=spacing), 1e-6)
+        >>> "FLAG" in found.diagnose()
+        False
+        """
         flags = [f"FLAG: {line}" for line in self.flags]
         return "\n".join([repr(self), *self.messages, *flags, self.solution.diagnose()])
 
@@ -98,29 +131,40 @@ def adapt(
 
     Parameters
     ----------
-    problem : its conditions and sources are functions of x, not arrays: the particles change.
-    make : spacing -> :class:`jsmitsm.Cloud`, where the spacing is a number or a function (M, D) -> (M,), as
-        ``lambda spacing: js.from_polygon(vertices, spacing)``. Its group names must not depend on the spacing.
-    tol : wanted error relative to the largest \\|u\\| (of all fields), or to the quantity.
-    order : of the expansions; "auto" lets the tolerance and the estimates decide.
-    start : the first spacing, a number or a function; a moderate cloud if not given.
-    quantity : a function of a :class:`jsmitsm.Solution` that returns one number; then the tolerance is on that number,
-        and particles are put where they matter for it: its adjoint weighs them. It must be differentiable by JAX for
-        that, as ``sol(points)``, ``sol.flux(group)``, ``sol.integral()`` and what jax.numpy makes of them are.
-    norm : "max", the largest error at the particles, or "l2", its root mean square over the domain.
-    max_particles, max_rounds : where the search ends.
-    progress : show a bar, where tqdm is installed and stderr is a terminal.
-    solve_options : ``depth``, ``formulation``, ``solver``, ``u0`` (a function) and others of :func:`jsmitsm.solve`. A
-        nonlinear problem starts from the solution of the round before.
+    problem : Problem
+        Its conditions and sources are functions of x, not arrays: the particles change.
+    make : function
+        Spacing -> ``js.Cloud``, where the spacing is a number or a function (M, D) -> (M,), as ``lambda spacing:
+        js.from_polygon(vertices, spacing)``. Its group names must not depend on the spacing.
+    tol : float
+        Wanted error relative to the largest |u| (of all fields), or to the quantity.
+    order : int or "auto"
+        Of the expansions; "auto" lets the tolerance and the estimates decide.
+    start : float or function, optional
+        The first spacing, a number or a function; a moderate cloud if not given.
+    quantity : function, optional
+        A function of a ``js.Solution`` that returns one number; then the tolerance is on that number, and particles
+        are put where they matter for it: its adjoint weighs them. It must be differentiable by JAX for that, as
+        ``sol(points)``, ``sol.flux(group)``, ``sol.integral()`` and what jax.numpy makes of them are.
+    norm : {"max", "l2"}
+        "max", the largest error at the particles, or "l2", its root mean square over the domain.
+    max_particles, max_rounds : int
+        Where the search ends.
+    progress : bool
+        Show a bar, where tqdm is installed and stderr is a terminal.
+    solve_options : optional
+        ``depth``, ``formulation``, ``solver``, ``u0`` (a function) and others of ``js.solve``. A nonlinear problem
+        starts from the solution of the round before.
 
     Returns
     -------
-    Adapted : ``solution``, ``cloud``, ``error``, ``reached``, ``history``. A solution with flags is never ``reached``.
+    Adapted
+        ``solution``, ``cloud``, ``error``, ``reached``, ``history``. A solution with flags is never ``reached``.
 
     Raises
     ------
     ValueError
-        For bad input, a ``make`` that returns no cloud or never uses its spacing, and whatever :func:`jsmitsm.solve`
+        For bad input, a ``make`` that returns no cloud or never uses its spacing, and whatever ``js.solve``
         refuses.
     SolveError
         Where no cloud could be solved on.

@@ -59,13 +59,16 @@ class Cloud:
 
     Parameters
     ----------
-    points : (N, D) float array, D = 1, 2 or 3 (also in 1D), in length units.
-    groups : maps a name to an integer index array. The groups are disjoint and cover every
-        particle; ``"interior"`` is one of them, every other one is a boundary group.
-    normals : (N, D) unit outward normals, NaN in the interior. Needed only where a boundary
-        condition uses them.
-    cell_groups : maps a name to an integer index array, as the materials of a mesh do: these may overlap (a particle
-        between two materials belongs to both) and need not cover the cloud. No condition refers to them.
+    points : array_like (N, D)
+        (N, D) float array, D = 1, 2 or 3 (also in 1D), in length units.
+    groups : mapping
+        Maps a name to an integer index array. The groups are disjoint and cover every particle; ``"interior"`` is
+        one of them, every other one is a boundary group.
+    normals : array_like (N, D), optional
+        (N, D) unit outward normals, NaN in the interior. Needed only where a boundary condition uses them.
+    cell_groups : mapping, optional
+        Maps a name to an integer index array, as the materials of a mesh do: these may overlap (a particle between
+        two materials belongs to both) and need not cover the cloud. No condition refers to them.
 
     Raises
     ------
@@ -73,7 +76,7 @@ class Cloud:
         For a wrong shape, NaN, overlapping or incomplete groups, duplicate particles.
 
     A cloud is a pytree: points and normals are leaves, groups and cell groups are static. It does not change: its
-    arrays are read-only copies, and :meth:`replace` makes another one.
+    arrays are read-only copies, and ``replace`` makes another one.
 
     Examples
     --------
@@ -138,7 +141,30 @@ class Cloud:
         return np.setdiff1d(np.arange(len(self)), self.groups[INTERIOR])
 
     def replace(self, points: ArrayLike | None = None, normals: ArrayLike | None = None) -> Cloud:
-        """The same groups with other points or normals (traced values welcome)."""
+        """The same groups with other points or normals (traced values welcome).
+
+        Parameters
+        ----------
+        points, normals : array_like (N, D), optional
+            What is replaced.
+
+        Returns
+        -------
+        Cloud
+            A new one; this one stays.
+
+        Raises
+        ------
+        ValueError
+            For another number of particles.
+
+        Examples
+        --------
+        >>> import jsmitsm as js
+        >>> rod = js.interval(0.0, 1.0, 5)
+        >>> rod.replace(points=2 * rod.points).spacing
+        0.5
+        """
         new = object.__new__(Cloud)
         if points is not None and np.shape(points) != self.points.shape:
             raise ValueError(
@@ -312,13 +338,33 @@ def _describe_groups(groups: Any) -> str:
 def rectangle(
     lo: Sequence[float], hi: Sequence[float], shape: Sequence[int], jitter: float = 0.0, seed: int = 0
 ) -> Cloud:
-    """A lattice of ``shape = (nx, ny)`` particles on the rectangle from ``lo`` to ``hi``.
+    """A lattice of particles on a rectangle; groups interior, left, right, bottom, top.
 
-    Groups: interior, left, right, bottom, top; a corner belongs to the first that claims it, in
-    that order. ``jitter`` moves interior particles by up to that fraction of the spacing along
-    each axis, reproducibly by ``seed``. Raises ValueError for an empty rectangle, fewer than two
-    particles along an axis, or a jitter of half a spacing or more.
+    A corner belongs to the first group that claims it, in that order.
 
+    Parameters
+    ----------
+    lo, hi : sequence of float (2,)
+        The lower left and the upper right corner.
+    shape : sequence of int (2,)
+        Particles along x and y.
+    jitter : float
+        Interior particles move by up to that fraction of the spacing along each axis.
+    seed : int
+        Makes the jitter reproducible.
+
+    Returns
+    -------
+    Cloud
+        In 2D.
+
+    Raises
+    ------
+    ValueError
+        For an empty rectangle, fewer than two particles along an axis, or a jitter of half a spacing or more.
+
+    Examples
+    --------
     >>> import jsmitsm as js
     >>> len(js.rectangle((0, 0), (4, 9), (5, 10)))
     50
@@ -327,9 +373,31 @@ def rectangle(
 
 
 def box(lo: Sequence[float], hi: Sequence[float], shape: Sequence[int], jitter: float = 0.0, seed: int = 0) -> Cloud:
-    """A lattice of ``shape = (nx, ny, nz)`` particles on the box from ``lo`` to ``hi``; ``jitter``,
-    ``seed`` and errors as for :func:`rectangle`, with the groups front (low z) and back (high z) besides.
+    """A lattice of particles on a box; groups as in ``js.rectangle``, then front (low z) and back (high z).
 
+    Parameters
+    ----------
+    lo, hi : sequence of float (3,)
+        Two opposite corners.
+    shape : sequence of int (3,)
+        Particles along x, y and z.
+    jitter : float
+        Interior particles move by up to that fraction of the spacing along each axis.
+    seed : int
+        Makes the jitter reproducible.
+
+    Returns
+    -------
+    Cloud
+        In 3D.
+
+    Raises
+    ------
+    ValueError
+        As ``js.rectangle``.
+
+    Examples
+    --------
     >>> import jsmitsm as js
     >>> sorted(js.box((0, 0, 0), (1, 1, 1), (3, 3, 3)).groups)
     ['back', 'bottom', 'front', 'interior', 'left', 'right', 'top']

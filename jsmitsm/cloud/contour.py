@@ -76,7 +76,7 @@ def _polylines(region: levelset.SdfRegion, cells: octree.Cells, coarse: octree.C
     if found is None:  # the boundary leaves the cells near it: the function is far from a distance
         found = _crossings(region, octree.join([cells, coarse]))
     assert found is not None  # beyond the box everything is positive
-    points, after = found
+    ends, share, after = found
     follow, loops, seen = after.tolist(), [], [False] * len(after)
     for first in range(len(follow)):
         loop, at = [], first
@@ -89,18 +89,17 @@ def _polylines(region: levelset.SdfRegion, cells: octree.Cells, coarse: octree.C
     if not loops:
         return []
     order = np.concatenate(loops)
-    distance, normals = region.distance(points[order])
-    # One step of Newton's method, no longer than the edges are.
+    points, normals = _on_edges(region, ends[order], share[order])
     ends = np.cumsum([len(loop) for loop in loops])
-    reach = np.linalg.norm(points[order] - points[after[order]], axis=1)
-    points = points[order] - np.clip(distance, -reach, reach)[:, None] * normals
     parts = [_without_specks(points[i:j], normals[i:j]) for i, j in zip([0, *ends[:-1]], ends)]
     return [part for part in parts if len(part.points) > 2]
 
 
-def _crossings(region: levelset.SdfRegion, cells: octree.Cells) -> tuple[np.ndarray, np.ndarray] | None:
-    """Points (E, 2) where edges of the triangles cross the zero level, and the one that follows each, domain on the
-    left; None where the boundary leaves the cells.
+def _crossings(
+    region: levelset.SdfRegion, cells: octree.Cells
+) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """The ends (E, 2, 2) of the edges of triangles that cross the zero level, about where they do (E,), and the edge
+    that follows each, domain on the left; None where the boundary leaves the cells.
 
     Every cell is a fan of triangles around its centre, over its corners and those of finer cells on its sides.
     """
@@ -144,8 +143,24 @@ def _crossings(region: levelset.SdfRegion, cells: octree.Cells) -> tuple[np.ndar
     after = np.empty(len(kept), np.int64)
     after[entered] = left
     i, j = np.concatenate([leave, enter])[first].T
-    share = value[i] / (value[i] - value[j])
-    return nodes[i] + share[:, None] * (nodes[j] - nodes[i]), after
+    return np.stack([nodes[i], nodes[j]], axis=1), value[i] / (value[i] - value[j]), after
+
+
+def _on_edges(region: levelset.SdfRegion, ends: np.ndarray, share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points of the zero level (E, 2) where edges (E, 2, 2) cross it, about at the given shares, and normals there."""
+    a, b = ends[:, 0], ends[:, 1]
+    start = a + share[:, None] * (b - a)
+    distance, before = region.distance(start)
+    reach = np.linalg.norm(b - a, axis=1)
+    points = start - np.clip(distance, -reach, reach)[:, None] * before
+    distance, normals = region.distance(points)
+    turned = (np.abs(distance) > 1e-3 * reach) | (np.einsum("md,md->m", normals, before) < _CORNER)
+    turned |= np.einsum("md,md->m", normals, np.roll(normals, -1, axis=0)) < _CORNER
+    near = np.flatnonzero(turned | np.roll(turned, 1) | np.roll(turned, -1))
+    if len(near):  # at corners a step off the edge may end on either side
+        points[near] = levelset.root(region, a[near], b[near], 1e-7)
+        normals[near] = region.distance(points[near])[1]
+    return points, normals
 
 
 def _without_specks(loop: np.ndarray, normals: np.ndarray) -> levelset.Boundary:

@@ -43,8 +43,17 @@ class Stencils:
 
     Attributes
     ----------
-    indices : (N, w) int32 array; the particle itself comes first, -1 fills the row.
-    radius : (N,) float array, the distance within which all particles are listed; None where nothing needs it.
+    indices : array (N, w)
+        (N, w) int32 array; the particle itself comes first, -1 fills the row.
+    radius : array (N,), optional
+        (N,) float array, the distance within which all particles are listed; None where nothing needs it.
+
+    Examples
+    --------
+    >>> import jsmitsm as js
+    >>> found = js.stencils(js.interval(0.0, 1.0, 5), size=3)
+    >>> found.indices[0].tolist()
+    [0, 1, 2]
     """
 
     indices: Array
@@ -68,11 +77,18 @@ def stencils(cloud: Cloud, *, size: int | None = None, radius: ArrayLike | None 
 
     Parameters
     ----------
-    cloud : in one of several regions neighbours are of the same region.
-    size : the number of nearest particles, the particle itself counted. Particles as far as the
-        last one enter as well, so that a lattice gets closed shells.
-    radius : all particles within this distance (a scalar or one per particle, length units),
-        the edge included.
+    cloud : Cloud
+        In one of several regions neighbours are of the same region.
+    size : int, optional
+        The number of nearest particles, the particle itself counted. Particles as far as the last one enter as
+        well, so that a lattice gets closed shells.
+    radius : float or array_like (N,), optional
+        All particles within this distance (a scalar or one per particle, length units), the edge included.
+
+    Returns
+    -------
+    Stencils
+        Every particle's neighbours.
 
     Raises
     ------

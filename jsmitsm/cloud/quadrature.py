@@ -38,7 +38,7 @@ def quadrature(cloud: Cloud, group: str | None = None, degree: int = 8) -> Quadr
     """Points and weights for integrals over a boundary group, or over the domain where no group is named.
 
     Over the domain: exact for polynomials of the ``degree`` where the boundary is straight, of error
-    O(spacing^(degree + 1)) where it curves smoothly; the normals are NaN. See :mod:`jsmitsm.cloud.domain_quadrature`.
+    O(spacing^(degree + 1)) where it curves smoothly; the normals are NaN.
 
     Between neighbouring boundary particles lie cubic facets that follow their normals (curved PN
     triangles, Vlachos et al. 2001, and their counterpart in 2D), flat at corners and where the
@@ -46,7 +46,24 @@ def quadrature(cloud: Cloud, group: str | None = None, degree: int = 8) -> Quadr
     error is O(spacing^4) on smooth boundaries, none on straight ones. Over the domain of a cloud of several regions
     the rules of all stand one after another; over an interface ``"a|b"`` the normals point from a to b.
 
-    Raises ValueError for a group that is no boundary group, and a degree that is no whole number from 1.
+    Parameters
+    ----------
+    cloud : Cloud
+        The particles.
+    group : str, optional
+        The name of a boundary group; the domain if not given.
+    degree : int
+        Of the polynomials that are integrated exactly over the domain.
+
+    Returns
+    -------
+    Quadrature
+        ``points`` (Q, D), ``weights`` (Q,) and ``normals`` (Q, D).
+
+    Raises
+    ------
+    ValueError
+        For a group that is no boundary group, and a degree that is no whole number from 1.
 
     Examples
     --------

@@ -12,7 +12,27 @@ from jsmitsm.cloud.regions.region_cloud import RegionCloud
 
 
 class Quality(NamedTuple):
-    """How evenly the particles of a cloud lie; see :func:`quality`."""
+    """How evenly the particles of a cloud lie; made by ``js.quality``.
+
+    Attributes
+    ----------
+    fill : float
+        Radius of the largest empty ball in the domain over the local spacing (0.58 for hexagons).
+    separation : float
+        Smallest distance of a pair over the local spacing (1 for any lattice).
+    mesh_ratio : float
+        fill / (separation / 2): 1.15 for hexagons, below 2 is even, above 4 is poor.
+    evenness : float
+        The least over the mean nearest distance, in local spacings.
+    fill_distance, separation_distance : float
+        The first two in length units (Wendland, Scattered Data Approximation, 2005, has half the latter).
+
+    Examples
+    --------
+    >>> import jsmitsm as js
+    >>> js.quality(js.interval(0.0, 1.0, 11)).mesh_ratio > 0.9
+    True
+    """
 
     fill: float
     separation: float
@@ -30,20 +50,24 @@ def quality(cloud: Cloud, spacing: filling.SpacingLike | None = None) -> Quality
 
     Parameters
     ----------
-    cloud : a :class:`Cloud`. With normals the boundary is told exactly; without them the domain is taken to be convex.
-        Of several regions the worst of each measure counts.
-    spacing : a number or a function (M, D) -> (M,); by default the mean nearest distance near each particle.
+    cloud : Cloud
+        With normals the boundary is told exactly; without them the domain is taken to be convex. Of several regions
+        the worst of each measure counts.
+    spacing : float or function, optional
+        A number or a function (M, D) -> (M,); by default the mean nearest distance near each particle.
 
     Returns
     -------
-    Quality, a named tuple: ``fill`` the radius of the largest empty ball in the domain over the local spacing
-    (0.58 for hexagons), ``separation`` the smallest distance of a pair over the local spacing (1 for any lattice),
-    ``mesh_ratio`` = fill / (separation / 2) (1.15 for hexagons, below 2 is even, above 4 is poor), ``evenness``
-    the least over the mean nearest distance, in local spacings; ``fill_distance`` and ``separation_distance`` the
-    first two in length units (Wendland, Scattered Data Approximation, 2005, has half the latter).
+    Quality
+        A named tuple.
 
-    Raises ValueError for fewer than D + 2 particles, and normals that point inward.
+    Raises
+    ------
+    ValueError
+        For fewer than D + 2 particles, and normals that point inward.
 
+    Examples
+    --------
     >>> import jsmitsm as js
     >>> round(js.quality(js.rectangle((0, 0), (1, 1), (11, 11))).mesh_ratio, 3)
     1.414

@@ -34,19 +34,26 @@ def from_sdf(
 
     Parameters
     ----------
-    sdf : a function of one point x (D,) -> scalar in ``jax.numpy``, negative inside; see ``js.sdf`` for
-        ready ones. It need not be a true distance, but must be continuous and cross zero with a slope.
-    bounds : (lo, hi), each (D,): a box that contains the domain.
-    spacing : distance between neighbours in length units, a number or a function (M, D) -> (M,) of numpy arrays.
-    seed : the same seed gives the same cloud.
-    groups : maps a name to a predicate: a batch of boundary points, a numpy array (M, D), to (M,) booleans. The
-        first that claims a particle gets it. Without it there is the one group ``"boundary"``.
+    sdf : function
+        A function of one point x (D,) -> scalar in ``jax.numpy``, negative inside; see ``js.sdf`` for ready ones.
+        It need not be a true distance, but must be continuous and cross zero with a slope.
+    bounds : pair of array_like (D,)
+        (lo, hi), each (D,): a box that contains the domain.
+    spacing : float or function
+        Distance between neighbours in length units, a number or a function (M, D) -> (M,) of numpy arrays.
+    seed : int
+        The same seed gives the same cloud.
+    groups : mapping, optional
+        Maps a name to a predicate: a batch of boundary points, a numpy array (M, D), to (M,) booleans. The first
+        that claims a particle gets it. Without it there is the one group ``"boundary"``.
 
     Returns
     -------
-    Cloud : interior particles first, then the boundary's. Corners of 2D shapes are particles. Normals are the unit
-        gradients of ``sdf``, at corners the normalised bisector, between two groups that of the own side. No interior
-        particle is closer to the boundary than about half a spacing. Use :func:`quality` to see how even the cloud is.
+    Cloud
+        Interior particles first, then the boundary's. Corners of 2D shapes are particles. Normals are the unit
+        gradients of ``sdf``, at corners the normalised bisector, between two groups that of the own side. No
+        interior particle is closer to the boundary than about half a spacing. Use ``js.quality`` to see how even
+        the cloud is.
 
     Raises
     ------
@@ -60,6 +67,8 @@ def from_sdf(
     the spacing varies it is filled by dithering and relaxed everywhere (in the spirit of Fornberg and Flyer, Comput.
     Math. Appl. 69, 2015, and of Slak and Kosec, SIAM J. Sci. Comput. 41, 2019).
 
+    Examples
+    --------
     >>> import jsmitsm as js
     >>> plate = js.sdf.difference(js.sdf.rectangle((0, 0), (2, 1)), js.sdf.circle((1, 0.5), 0.25))
     >>> cloud = js.from_sdf(plate, ((0, 0), (2, 1)), 0.05, groups={
@@ -92,18 +101,25 @@ def from_polygon(
 
     Parameters
     ----------
-    vertices : (V, 2), in order, either way round, the last joined to the first.
-    spacing : distance between neighbours in length units, a number or a function (M, 2) -> (M,) of numpy arrays.
-    holes : polygons (V, 2) cut out of it.
-    seed : the same seed gives the same cloud.
-    groups : predicates as for :func:`from_sdf`. Without them the groups are ``"boundary"`` for the outer polygon and
+    vertices : array_like (V, 2)
+        (V, 2), in order, either way round, the last joined to the first.
+    spacing : float or function
+        Distance between neighbours in length units, a number or a function (M, 2) -> (M,) of numpy arrays.
+    holes : sequence of array_like (V, 2)
+        Polygons (V, 2) cut out of it.
+    seed : int
+        The same seed gives the same cloud.
+    groups : mapping, optional
+        Predicates as for ``js.from_sdf``. Without them the groups are ``"boundary"`` for the outer polygon and
         ``"hole0"``, ``"hole1"``, ... for the holes.
 
     Returns
     -------
-    Cloud : interior particles first, then the boundary's. Every corner is a particle, its normal the normalised
+    Cloud
+        Interior particles first, then the boundary's. Every corner is a particle, its normal the normalised
         bisector of its edges', between two groups that of the own edge. Where many short edges stand for a curve
-        (turns of less than 20 degrees, edges shorter than the spacing), particles are spread evenly along them instead.
+        (turns of less than 20 degrees, edges shorter than the spacing), particles are spread evenly along them
+        instead.
 
     Raises
     ------
@@ -111,6 +127,8 @@ def from_polygon(
         For a polygon that crosses or touches itself, a hole that is not inside or meets another, repeated vertices,
         a spacing too coarse for the shape, or wrong groups.
 
+    Examples
+    --------
     >>> import jsmitsm as js
     >>> cloud = js.from_polygon([(0, 0), (2, 0), (2, 1), (1, 1), (1, 2), (0, 2)], 0.1)
     >>> len(cloud.groups["boundary"])

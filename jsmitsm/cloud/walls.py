@@ -258,7 +258,7 @@ class Walls:
 
 
 def nearest_seen(points: np.ndarray, size: int, which: np.ndarray | None, walls: Walls | None) -> Stencils:
-    """As :func:`nearest`, of the particles that each one sees."""
+    """As ``nearest``, of the particles that each one sees."""
     found = nearest(points, size, which)
     rows = np.arange(len(points)) if which is None else which
     hidden = None if walls is None else walls.hidden(np.asarray(found.indices), rows)
@@ -282,7 +282,7 @@ def nearest_seen(points: np.ndarray, size: int, which: np.ndarray | None, walls:
 
 
 def within_seen(points: np.ndarray, radius: Any, which: np.ndarray | None, walls: Walls | None) -> Stencils:
-    """As :func:`within`, of the particles that each one sees."""
+    """As ``within``, of the particles that each one sees."""
     return seen(within(points, radius, which), which, walls)
 
 

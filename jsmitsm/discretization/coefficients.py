@@ -61,7 +61,7 @@ def numbers(disc: Discretization, problem: Problem, taylor: Any = None, everywhe
     ids = np.arange(len(disc.cloud)) if everywhere else disc.active
     here = None if taylor is None else picked(taylor, ids)
     jac, source = operator_numbers(disc, problem, picked(disc.cloud.points, ids), here)
-    if disc.rec.depth and disc.linear and disc.traced.source == "variable" and disc.traced.kinked:
+    if disc.rec.depth and disc.linear and disc.traced.source == "variable" and disc.traced.kinked_source:
         values = -disc.traced.residuals(disc.cloud.points, params=problem.params)
         source = softened(disc, ids, source, values)
     held = [((group.ids, k), value()) for group in disc.groups for k, value in group.held.items()]

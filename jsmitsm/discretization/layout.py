@@ -18,6 +18,7 @@ from jsmitsm.discretization.supports import check_supports, cut_off, default_ker
 from jsmitsm.equation.branches import FIELD
 from jsmitsm.equation.closing import closed
 from jsmitsm.equation.conditions import Group, group_conditions
+from jsmitsm.equation.field import RATE
 from jsmitsm.equation.problem import Problem
 from jsmitsm.equation.regions.per_region import PerRegion
 from jsmitsm.equation.traced import Traced
@@ -332,6 +333,8 @@ def _check_operator(traced: Traced, problem: Problem, order: int) -> None:
             f"pde: returns {traced.n_equations} residual(s) for fields={problem.fields}; "
             "a system of F fields needs F residuals"
         )
+    if any(f >= RATE for f, _ in traced.slots):
+        raise ValueError("pde: js.dt(u) is a rate in time, of which a steady problem knows nothing; use js.evolve")
     for e, m in enumerate(traced.order):
         if m < 0:
             raise ValueError(f"pde: residual {e} does not depend on u; use u(x), js.grad(u)(x), js.laplacian(u)(x) ...")

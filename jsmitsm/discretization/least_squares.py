@@ -27,7 +27,7 @@ def least_squares(
 
     Every particle contributes the misfit of its local fit, those with held values too: the
     projector of a fit is idempotent, so nothing is squared. A list ``parts`` is filled with what
-    :func:`least_squares_right_side` needs.
+    ``least_squares_right_side`` needs.
     """
     shared, there = shared_elimination(disc, nums), around(disc, nums)
 

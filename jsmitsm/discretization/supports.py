@@ -67,7 +67,7 @@ def walls_of(problem: Problem, cloud: Cloud, images: Images) -> Walls | None:
 def find_stencils(
     cloud: Cloud, kernel: Kernel | None, scheme: Scheme, images: Images, conditioned: np.ndarray, walls: Walls | None
 ) -> Stencils:
-    """Neighbours that each particle sees, see :mod:`jsmitsm.cloud.walls`; outward normals are checked by the way."""
+    """Neighbours that each particle sees, see ``jsmitsm.cloud.walls``; outward normals are checked by the way."""
     found = _found_stencils(cloud, kernel, scheme, images, conditioned, walls)
     if walls is not None and cloud.dim == 1:
         walls.check_outward(np.asarray(found.indices))

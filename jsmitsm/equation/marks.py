@@ -23,7 +23,13 @@ def meant(function: Callable[..., Any]) -> Callable[..., Any]:
 
     Parameters
     ----------
-    function : any function; it is called with the same arguments and returns the same.
+    function : function
+        Any function; it is called with the same arguments and returns the same.
+
+    Returns
+    -------
+    function
+        The same, marked.
 
     Raises
     ------

@@ -26,10 +26,25 @@ def partial(u: Function, multi_index: MultiIndex | int) -> Function: ...
 def partial(u: Any, multi_index: MultiIndex | int) -> Any:
     """The derivative d^a u, a function of the point.
 
-    Parameters: ``u``, a field or any function of a point (D,); ``multi_index``, D
-    non-negative integers, the order along each axis (in 1D an integer will do).
-    Raises ``ValueError`` if its length is not D.
+    Parameters
+    ----------
+    u : field or function
+        A local field, or any function of a point (D,).
+    multi_index : tuple of int, or int
+        D non-negative integers, the order along each axis; in 1D an integer will do.
 
+    Returns
+    -------
+    field or function
+        Of the kind of ``u``.
+
+    Raises
+    ------
+    ValueError
+        If the length of ``multi_index`` is not D.
+
+    Examples
+    --------
     >>> import jax.numpy as jnp
     >>> float(partial(lambda y: y[0] ** 2 * y[1], (1, 1))(jnp.array([3.0, 5.0])))
     6.0
@@ -60,9 +75,23 @@ def grad(u: Function) -> Function: ...
 def grad(u: Any) -> Any:
     """The gradient of ``u``, a function of the point; derivatives on the last axis.
 
-    ``grad(u)(x)`` is (D,) for a scalar ``u``, (F, D) for a vector.  ``u`` is a field or any
-    function of a point (D,). Raises ``ValueError`` for what is neither.
+    Parameters
+    ----------
+    u : field or function
+        A local field, or any function of a point (D,).
 
+    Returns
+    -------
+    field or function
+        ``grad(u)(x)`` is (D,) for a scalar ``u``, (F, D) for a vector.
+
+    Raises
+    ------
+    ValueError
+        For what is neither a field nor a function.
+
+    Examples
+    --------
     >>> import jax.numpy as jnp
     >>> grad(lambda y: y[0] * y[1])(jnp.array([3.0, 5.0])).tolist()
     [5.0, 3.0]
@@ -80,10 +109,25 @@ def hessian(u: Field | LocalField) -> LocalField: ...
 @overload
 def hessian(u: Function) -> Function: ...
 def hessian(u: Any) -> Any:
-    """The second derivatives of ``u``, a function of the point: (D, D), or (F, D, D).
+    """The second derivatives of ``u``, a function of the point.
 
-    Raises ``ValueError`` for what is neither a field nor a function.
+    Parameters
+    ----------
+    u : field or function
+        A local field, or any function of a point (D,).
 
+    Returns
+    -------
+    field or function
+        ``hessian(u)(x)`` is (D, D), or (F, D, D) for a vector ``u``.
+
+    Raises
+    ------
+    ValueError
+        For what is neither a field nor a function.
+
+    Examples
+    --------
     >>> import jax.numpy as jnp
     >>> hessian(lambda y: y[0] ** 2 * y[1])(jnp.array([3.0, 5.0])).tolist()
     [[10.0, 6.0], [6.0, 0.0]]
@@ -109,10 +153,25 @@ def laplacian(u: Same) -> Same: ...
 @overload
 def laplacian(u: Function) -> Function: ...
 def laplacian(u: Any) -> Any:
-    """The sum of the second derivatives of ``u``, a function of the point: a scalar, or (F,).
+    """The sum of the second derivatives of ``u``, a function of the point.
 
-    Raises ``ValueError`` for what is neither a field nor a function.
+    Parameters
+    ----------
+    u : field or function
+        A local field, or any function of a point (D,).
 
+    Returns
+    -------
+    field or function
+        ``laplacian(u)(x)`` is a scalar, or (F,) for a vector ``u``.
+
+    Raises
+    ------
+    ValueError
+        For what is neither a field nor a function.
+
+    Examples
+    --------
     >>> import jax.numpy as jnp
     >>> float(laplacian(lambda y: y[0] ** 2 * y[1])(jnp.array([3.0, 5.0])))
     10.0
@@ -132,9 +191,23 @@ def divergence(v: Function) -> Function: ...
 def divergence(v: Any) -> Any:
     """The divergence of ``v``, a function of the point, summed over the last axis.
 
-    ``v(x)`` is (D,) (the result a scalar) or (F, D) (row by row: F values).  Raises
-    ``ValueError`` if the last axis is not of length D.
+    Parameters
+    ----------
+    v : field or function
+        ``v(x)`` is (D,), or (F, D) for one divergence a row.
 
+    Returns
+    -------
+    field or function
+        ``divergence(v)(x)`` is a scalar, or (F,).
+
+    Raises
+    ------
+    ValueError
+        If the last axis is not of length D.
+
+    Examples
+    --------
     >>> import jax.numpy as jnp
     >>> float(divergence(lambda y: y ** 2)(jnp.array([3.0, 5.0])))
     16.0
@@ -165,11 +238,27 @@ def divergence(v: Any) -> Any:
 
 
 def dt(u: Same, order: int = 1) -> Same:
-    """The derivative of ``u`` in time, a function of the point; for the problems of :func:`jsmitsm.evolve`.
+    """The derivative of ``u`` in time, a function of the point; for the problems of ``js.evolve``.
 
-    Parameters: ``u``, the unknown field (or some of a system's fields); ``order``, 1 or 2.
-    Raises ``ValueError`` for what is no unknown, such as a derivative of it or a function of the point.
+    Parameters
+    ----------
+    u : field
+        The unknown, or some of a system's fields.
+    order : int
+        1 or 2.
 
+    Returns
+    -------
+    field
+        Of the kind of ``u``.
+
+    Raises
+    ------
+    ValueError
+        For what is no unknown, such as a derivative of it or a function of the point.
+
+    Examples
+    --------
     >>> import jsmitsm as js
     >>> heat = lambda u, x, t: js.dt(u)(x) - js.laplacian(u)(x)
     """

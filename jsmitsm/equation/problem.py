@@ -17,10 +17,25 @@ from jsmitsm.runtime.tracers import is_traced
 
 @jax.tree_util.register_pytree_node_class
 class Condition:
-    """A boundary condition; made by :func:`dirichlet`, :func:`neumann`, :func:`robin`,
-    :func:`condition`, :func:`periodic`, :func:`fix` or :func:`free`.
+    """A boundary condition.
 
-    Numbers and arrays in it are leaves of the pytree, functions are static.
+    Made by ``js.dirichlet``, ``js.neumann``, ``js.robin``, ``js.condition``, ``js.interface``, ``js.periodic``,
+    ``js.fix`` or ``js.free``. Numbers and arrays in it are leaves of the pytree, functions are static.
+
+    Parameters
+    ----------
+    kind : str
+        The name of the function that made it.
+    field : int, optional
+        The field it holds for; all of them if not given.
+    **parts : number, array or function
+        What the condition is made of, by name.
+
+    Examples
+    --------
+    >>> import jsmitsm as js
+    >>> isinstance(js.dirichlet(0.0), js.Condition)
+    True
     """
 
     def __init__(self, kind: str, field: int | None = None, **parts: Any):
@@ -63,13 +78,26 @@ class Condition:
 def dirichlet(value: ValueOrFunction, field: int | None = None) -> Condition:
     """u = value on a group.
 
-    value : a scalar, an array over the group (n,), or a function of x (and of params, where the
-        problem has them). For a system without ``field``: a scalar for all fields, (F,), (n, F),
-        or a function returning (F,).
-    field : the field it holds for; all of them if not given.
+    Parameters
+    ----------
+    value : float, array (n,) or function
+        A number, an array over the group, or a function of x (and of params, where the problem has them). For a
+        system without ``field``: a number for all fields, (F,), (n, F), or a function returning (F,).
+    field : int, optional
+        The field it holds for; all of them if not given.
 
-    Raises ValueError for what is no number, array or function, and for NaN.
+    Returns
+    -------
+    Condition
+        To be put under the name of a group in ``bcs``.
 
+    Raises
+    ------
+    ValueError
+        For what is no number, array or function, and for NaN.
+
+    Examples
+    --------
     >>> import jsmitsm as js
     >>> js.dirichlet(1.0)
     dirichlet(value=1.0)
@@ -78,8 +106,27 @@ def dirichlet(value: ValueOrFunction, field: int | None = None) -> Condition:
 
 
 def neumann(value: ValueOrFunction, field: int | None = None) -> Condition:
-    """n . grad u = value on a group; ``value`` and ``field`` as in :func:`dirichlet`.
+    """n . grad u = value on a group, n the outward unit normal.
 
+    Parameters
+    ----------
+    value : float, array (n,) or function
+        As in ``js.dirichlet``.
+    field : int, optional
+        The field it holds for; all of them if not given.
+
+    Returns
+    -------
+    Condition
+        To be put under the name of a group in ``bcs``.
+
+    Raises
+    ------
+    ValueError
+        For what is no number, array or function, and for NaN.
+
+    Examples
+    --------
     >>> import jsmitsm as js
     >>> js.neumann(lambda x: x[0])
     neumann(value=<function>)
@@ -90,10 +137,27 @@ def neumann(value: ValueOrFunction, field: int | None = None) -> Condition:
 def robin(
     a: ValueOrFunction, b: ValueOrFunction, value: ValueOrFunction, field: int | None = None
 ) -> Condition:
-    """a u + b n . grad u = value on a group; each of the three, and ``field``, as in :func:`dirichlet`.
+    """a u + b n . grad u = value on a group, n the outward unit normal.
 
-    Raises ValueError where ``a`` and ``b`` are both zero.
+    Parameters
+    ----------
+    a, b, value : float, array (n,) or function
+        Each as the value of ``js.dirichlet``.
+    field : int, optional
+        The field it holds for; all of them if not given.
 
+    Returns
+    -------
+    Condition
+        To be put under the name of a group in ``bcs``.
+
+    Raises
+    ------
+    ValueError
+        Where ``a`` and ``b`` are both zero, for what is no number, array or function, and for NaN.
+
+    Examples
+    --------
     >>> import jsmitsm as js
     >>> js.robin(1.0, 2.0, 0.0)
     robin(a=1.0, b=2.0, value=0.0)
@@ -106,11 +170,26 @@ def robin(
 
 
 def condition(residual: Callable[..., Any]) -> Condition:
-    """A general condition, ``residual(u, x, n) = 0`` (and ``params`` last, where given).
+    """A general condition, residual = 0.
 
-    ``residual`` returns a scalar, or a vector where it states several conditions at once; ``n``
-    is the unit outward normal. Raises ValueError for what is no function.
+    Parameters
+    ----------
+    residual : function
+        ``residual(u, x, n)`` (and ``params`` last, where given) with the unit outward normal ``n``; returns a
+        scalar, or a vector where it states several conditions at once.
 
+    Returns
+    -------
+    Condition
+        To be put under the name of a group in ``bcs``.
+
+    Raises
+    ------
+    ValueError
+        For what is no function.
+
+    Examples
+    --------
     >>> import jsmitsm as js
     >>> js.condition(lambda u, x, n: n @ js.grad(u)(x) + u(x) ** 4)
     condition(residual=<function>)
@@ -121,11 +200,27 @@ def condition(residual: Callable[..., Any]) -> Condition:
 
 
 def periodic(first: str, second: str) -> Condition:
-    """The groups ``first`` and ``second`` are images of each other under a translation.
+    """Two groups that are images of each other under a translation.
 
     Give it under the key of either group; the particles of ``second`` take the values of ``first``.
-    Raises ValueError unless two different names are given.
 
+    Parameters
+    ----------
+    first, second : str
+        Names of the groups.
+
+    Returns
+    -------
+    Condition
+        To be put under the name of either group in ``bcs``.
+
+    Raises
+    ------
+    ValueError
+        Unless two different names are given.
+
+    Examples
+    --------
     >>> import jsmitsm as js
     >>> js.periodic("left", "right")
     periodic(groups=('left', 'right'))
@@ -136,10 +231,29 @@ def periodic(first: str, second: str) -> Condition:
 
 
 def fix(indices: ArrayLike, value: ValueOrFunction, field: int | None = None) -> Condition:
-    """Hold the particles ``indices`` (interior ones too) at ``value``; give it under any free key.
+    """Hold some particles, interior ones too.
 
-    ``value`` and ``field`` as in :func:`dirichlet`. Raises ValueError for numbers that are none, or given twice.
+    Parameters
+    ----------
+    indices : int or array_like of int
+        Numbers of particles in the cloud's order.
+    value : float, array (n,) or function
+        As in ``js.dirichlet``.
+    field : int, optional
+        The field it holds for; all of them if not given.
 
+    Returns
+    -------
+    Condition
+        To be put under any free key in ``bcs``.
+
+    Raises
+    ------
+    ValueError
+        For numbers that are none, or given twice.
+
+    Examples
+    --------
     >>> import jsmitsm as js
     >>> js.fix([12], 0.0)
     fix(indices=(12,), value=0.0)
@@ -156,6 +270,13 @@ def fix(indices: ArrayLike, value: ValueOrFunction, field: int | None = None) ->
 def free() -> Condition:
     """No condition on a group: the equation alone holds there (outflow, final time).
 
+    Returns
+    -------
+    Condition
+        To be put under the name of a group in ``bcs``.
+
+    Examples
+    --------
     >>> import jsmitsm as js
     >>> js.free()
     free()
@@ -195,14 +316,18 @@ class Problem:
 
     Parameters
     ----------
-    pde : function ``(u, x)`` or ``(u, x, params)`` returning the residual at the point x (D,):
-        a scalar, or (F,) for a system. ``u`` is a local field, see :mod:`jsmitsm.equation.operators`. For a cloud of
-        several regions (:func:`jsmitsm.regions`) a dict of them, one for each region by its name.
-    bcs : maps each boundary group to a condition, or to a list of them where the operator's
-        order or the number of fields needs several; and each interface ``"a|b"`` to :func:`interface`.
-    fields : number F of unknown fields.
-    params : any pytree of numbers. Where it is given, every function of the problem takes it as
-        its last argument, and new numbers in it never recompile.
+    pde : function
+        Function ``(u, x)`` or ``(u, x, params)`` returning the residual at the point x (D,): a scalar, or (F,) for
+        a system. ``u`` is a local field, see ``jsmitsm.equation.operators``. For a cloud of several regions
+        (``js.regions``) a dict of them, one for each region by its name.
+    bcs : mapping
+        Maps each boundary group to a condition, or to a list of them where the operator's order or the number of
+        fields needs several; and each interface ``"a|b"`` to ``js.interface``.
+    fields : int
+        Number F of unknown fields.
+    params : pytree, optional
+        Any pytree of numbers. Where it is given, every function of the problem takes it as its last argument, and
+        new numbers in it never recompile.
 
     Raises
     ------
@@ -242,7 +367,30 @@ class Problem:
         self.bcs = {name: _listed(name, value, self.fields) for name, value in bcs.items()}
 
     def replace(self, **changes: Any) -> Problem:
-        """The same problem with other ``changes``: ``params``, ``pde``, ``bcs`` or ``fields``; ValueError for more."""
+        """The same problem with other parts.
+
+        Parameters
+        ----------
+        **changes : any
+            ``params``, ``pde``, ``bcs`` or ``fields``.
+
+        Returns
+        -------
+        Problem
+            A new one; this one stays.
+
+        Raises
+        ------
+        ValueError
+            For other names.
+
+        Examples
+        --------
+        >>> import jsmitsm as js
+        >>> problem = js.Problem(lambda u, x, k: k * js.laplacian(u)(x), {"left": js.dirichlet(0.0)}, params=1.0)
+        >>> problem.replace(params=2.0).params
+        2.0
+        """
         unknown = sorted(set(changes) - {"pde", "bcs", "fields", "params"})
         if unknown:
             raise ValueError(f"{unknown[0]}: no part of a Problem; it has pde, bcs, fields and params"

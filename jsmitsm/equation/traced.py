@@ -116,16 +116,18 @@ class Traced:
         return self._compute(inputs, 0, False, True)[1][:, 0]
 
     @cached_property
-    def kinked(self) -> bool:
-        """Whether any operation has kinks or jumps, where Taylor series end."""
-        return _kinked(self._record.jaxpr)
+    def kinked_source(self) -> bool:
+        """Whether the source may have kinks or jumps, where its Taylor series end, and the coefficients have none."""
+        needed = lambda jac: levels(self._record.jaxpr, self._wanted(jac, not jac))  # noqa: E731
+        source, operator = (any(_kinked(eqn) for eqn, _ in needed(jac)) for jac in (False, True))
+        return source and not operator
 
     def with_any_numbers(self) -> Traced:
         """The same with some numbers for the constants that are only traced."""
         return replace(self, _record=self._record._replace(consts=tuple(map(any_number, self._record.consts))))
 
     def jumps(self, points: Any, near: Any, *, params: Any = None, slots: Any = None) -> str | None:
-        """What jumps under a derivative, in words, see :mod:`jsmitsm.jumps`; None: nothing does."""
+        """What jumps under a derivative, in words, see ``jsmitsm.jumps``; None: nothing does."""
         if self.branches is None:
             return None
         consts = self._record.consts[len(self._record.consts) - len(self._record.written.constvars) :]
@@ -304,8 +306,8 @@ class _Inputs:
         return self._replace(points=self.points[cut], extras=[e[cut] for e in self.extras], slots=slots)
 
 
-def _kinked(jaxpr: Any) -> bool:
-    return any(eqn.primitive.name in KINKS or any(map(_kinked, inner_jaxprs(eqn))) for eqn in jaxpr.eqns)
+def _kinked(eqn: Any) -> bool:
+    return eqn.primitive.name in KINKS or any(_kinked(e) for inner in inner_jaxprs(eqn) for e in inner.eqns)
 
 
 def _zeros(value: Any) -> np.ndarray:

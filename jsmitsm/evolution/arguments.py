@@ -47,7 +47,8 @@ def check(problem, cloud, t, steps, tol, order, scheme, throw, progress) -> None
         if isinstance(tol, bool) or not isinstance(tol, (int, float, np.number)) or not 1e-13 <= float(tol) <= 0.1:
             raise ValueError(f"tol: expected a number from 1e-13 to 0.1, relative to the solution, got {short(tol)}")
     if not isinstance(scheme, str) or scheme not in SCHEMES:
-        raise ValueError(f"scheme: {scheme!r} is none of {', '.join(map(repr, SCHEMES))}{did_you_mean(scheme, SCHEMES)}")
+        known = ", ".join(map(repr, SCHEMES))
+        raise ValueError(f"scheme: {scheme!r} is none of {known}{did_you_mean(str(scheme), SCHEMES)}")
     if isinstance(order, bool) or not isinstance(order, (int, np.integer)) or not 1 <= order <= HIGHEST:
         raise ValueError(f"order: expected a whole number from 1 to {HIGHEST}, got {short(order)}")
     for value, name in ((throw, "throw"), (progress, "progress")):

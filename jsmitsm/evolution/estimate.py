@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from jsmitsm.discretization.pencil.assemble import assemble_pencil
-from jsmitsm.evolution import dense_output
 from jsmitsm.evolution.run import Run
-from jsmitsm.evolution.semidiscrete import Semidiscrete
+from jsmitsm.evolution.space.semidiscrete import Semidiscrete
+from jsmitsm.evolution.steps import dense_output
 from jsmitsm.runtime.progress import bar
 from jsmitsm.taylor.multi_indices import HIGHEST
 

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm.cloud.cloud import Cloud
-from jsmitsm.evolution import dense_output
-from jsmitsm.evolution.local_fits import StateFit
+from jsmitsm.evolution.space.local_fits import StateFit
+from jsmitsm.evolution.steps import dense_output
 from jsmitsm.runtime.arrays import Array
 from jsmitsm.runtime.tracers import frozen, is_traced
 from jsmitsm.solution.fit import Recipe
@@ -22,17 +22,25 @@ from jsmitsm.solution.solution import Solution
 class Evolution:
     """A solution in time, at saved moments and between them.
 
+
+    ``at(t)`` is the solution at any time, callable like a ``js.Solution``. To go on from the end give
+
+    ``u0=run.u[-1]``, of second order ``u0=(run.u[-1], run.rate[-1])``.
+
     Attributes
     ----------
-    t : (S,) the saved times, from the start to the end.
-    u : (S, N) values at the particles, (S, N, F) for a system.
-    rate : the same of du/dt for a problem of second order in time, else None.
-    converged : whether the run reached its end.
-    flags : sentences that speak against it; none for a healthy one.
-    stats : seconds, steps, scheme, factorisations, what was skipped.
-
-    ``at(t)`` is the solution at any time, callable like a :class:`jsmitsm.Solution`. To go on from the end give
-    ``u0=run.u[-1]``, of second order ``u0=(run.u[-1], run.rate[-1])``.
+    t : array (S,)
+        (S,) the saved times, from the start to the end.
+    u : array (S, N) or (S, N, F)
+        (S, N) values at the particles, (S, N, F) for a system.
+    rate : array (S, N) or (S, N, F), optional
+        The same of du/dt for a problem of second order in time, else None.
+    converged : bool
+        Whether the run reached its end.
+    flags : list of str
+        Sentences that speak against it; none for a healthy one.
+    stats : dict
+        Seconds, steps, scheme, factorisations, what was skipped.
 
     Examples
     --------
@@ -76,7 +84,24 @@ class Evolution:
         return [] if self._report is None else list(self._report.flags)
 
     def diagnose(self) -> str:
-        """In words: how the run went."""
+        """In words: how the run went.
+
+        Returns
+        -------
+        str
+            Several lines; those that begin with FLAG speak against the run.
+
+        Examples
+        --------
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import jax.numpy as jnp, jsmitsm as js
+        >>> ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(0.0)}
+        >>> heat = js.Problem(lambda u, x, t: js.dt(u)(x) - js.laplacian(u)(x), ends)
+        >>> start = lambda x: jnp.sin(jnp.pi * x[0])
+        >>> run = js.evolve(heat, js.interval(0.0, 1.0, 21), start, t=(0.0, 0.1), steps=20)
+        >>> "FLAG" in run.diagnose()
+        False
+        """
         lines = [repr(self)]
         if not is_traced(self.converged) and not bool(np.all(self.converged)):
             lines.append(f"The run did NOT reach its end; the last good state is that of t = {float(self.t[-1]):g}.")
@@ -95,13 +120,38 @@ class Evolution:
         return "\n".join(lines)
 
     def at(self, t: Any) -> Solution:
-        """The solution at the time ``t`` (a number): values anywhere, gradients, integrals.
+        """The solution at any time: values anywhere, gradients, integrals.
 
-        Between the steps of the run by the polynomial in t through the six nearest of them. Raises ValueError for
-        times outside of the run.
+        Between the steps of the run by the polynomial in t through the six nearest of them.
+
+        Parameters
+        ----------
+        t : float
+            The time.
+
+        Returns
+        -------
+        Solution
+            Of that moment.
+
+        Raises
+        ------
+        ValueError
+            For times outside of the run.
+
+        Examples
+        --------
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import jax.numpy as jnp, jsmitsm as js
+        >>> ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(0.0)}
+        >>> heat = js.Problem(lambda u, x, t: js.dt(u)(x) - js.laplacian(u)(x), ends)
+        >>> start = lambda x: jnp.sin(jnp.pi * x[0])
+        >>> run = js.evolve(heat, js.interval(0.0, 1.0, 21), start, t=(0.0, 0.1), steps=20)
+        >>> round(float(run.at(0.05)([[0.5]])[0]), 3)
+        0.611
         """
         if is_traced(self._u) or jnp.ndim(self._u) != 3:
-            raise ValueError("at: inside of a JAX transform, or of a stack made by jax.vmap, only .t and .u can be read")
+            raise ValueError("at: inside of a JAX transform, or of what jax.vmap made, only .t and .u can be read")
         try:
             time = float(t)
         except (TypeError, ValueError):
@@ -121,10 +171,30 @@ class Evolution:
         return Solution(u, self.cloud, self._recipe, self._fit, self.converged, 1, stats)
 
     def error_estimate(self) -> Array:
-        """Estimated error at every particle and saved time, (S, N) or (S, N, F).
+        """Estimated error at every particle and saved time.
 
-        In space by the defect that a pencil of order p + 2 finds, in time by the embedded scheme. Computed when asked
-        for. Raises ValueError for what came out of a JAX transform or a pickle.
+        In space by the defect that a pencil of order p + 2 finds, in time by the embedded scheme. Computed when asked.
+
+        Returns
+        -------
+        array (S, N) or (S, N, F)
+            In units of u.
+
+        Raises
+        ------
+        ValueError
+            For what came out of a JAX transform or a pickle.
+
+        Examples
+        --------
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import jax.numpy as jnp, jsmitsm as js
+        >>> ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(0.0)}
+        >>> heat = js.Problem(lambda u, x, t: js.dt(u)(x) - js.laplacian(u)(x), ends)
+        >>> start = lambda x: jnp.sin(jnp.pi * x[0])
+        >>> run = js.evolve(heat, js.interval(0.0, 1.0, 21), start, t=(0.0, 0.1), steps=20)
+        >>> run.error_estimate().shape
+        (2, 21)
         """
         if self._report is None:
             raise ValueError(
@@ -144,9 +214,28 @@ class Evolution:
         return f"Evolution({ends}, u: {shape}, converged={bool(np.all(self.converged))})"
 
     def to_xarray(self) -> Any:
-        """The saved states as an ``xarray.Dataset`` with the dimensions time, particle (and field).
+        """The saved states as a data set with the dimensions time, particle (and field).
 
-        Raises ImportError where xarray is not installed.
+        Returns
+        -------
+        xarray.Dataset
+            ``u``, and ``rate`` for second order in time.
+
+        Raises
+        ------
+        ImportError
+            Where xarray is not installed.
+
+        Examples
+        --------
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import jax.numpy as jnp, jsmitsm as js
+        >>> ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(0.0)}
+        >>> heat = js.Problem(lambda u, x, t: js.dt(u)(x) - js.laplacian(u)(x), ends)
+        >>> start = lambda x: jnp.sin(jnp.pi * x[0])
+        >>> run = js.evolve(heat, js.interval(0.0, 1.0, 21), start, t=(0.0, 0.1), steps=20)
+        >>> run.to_xarray().u.dims
+        ('time', 'particle')
         """
         try:
             import xarray

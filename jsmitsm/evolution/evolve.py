@@ -10,9 +10,10 @@ from jsmitsm.cloud.neighbours import Stencils
 from jsmitsm.equation.problem import Problem
 from jsmitsm.evolution.arguments import Scheme, check, saved_times, starting_values
 from jsmitsm.evolution.evolution import Evolution
+from jsmitsm.evolution.gradient.differentiable import differentiable
 from jsmitsm.evolution.march import march
 from jsmitsm.evolution.run import Run
-from jsmitsm.evolution.timed import timed
+from jsmitsm.evolution.space.timed import timed
 from jsmitsm.runtime.arrays import ValueOrFunction
 from jsmitsm.runtime.progress import bar
 from jsmitsm.runtime.tracers import is_traced
@@ -45,25 +46,46 @@ def evolve(
 
     Parameters
     ----------
-    u0 : the start, a function of x, a number or an array (N,) or (N, F); for second order in time a pair of them, u
+    problem : Problem
+        Its functions take the time.
+    cloud : Cloud
+        The particles it is solved on.
+    u0 : function, array_like or pair of them
+        The start, a function of x, a number or an array (N,) or (N, F); for second order in time a pair of them, u
         and its rate. Where it differs from the conditions the run begins with the impulse that this is.
-    t : (t0, t1), the start and the end.
-    steps : so many equal steps; or
-    tol : steps whose estimated error, relative to the largest value so far, stays below it.
-    order : of the discretization in space, the degree of the fits.
-    scheme : "esdirk" (KenCarp4, order 4), "radau" (Radau IIA, order 5, for linear problems), "imex" (KenCarp4 with
-        its explicit half for what is nonlinear), "euler" (backward), or "auto": radau for linear problems of order 6
+    t : pair of float
+        (t0, t1), the start and the end.
+    steps : int, optional
+        So many equal steps; or
+    tol : float, optional
+        Steps whose estimated error, relative to the largest value so far, stays below it.
+    order : int
+        Of the discretization in space, the degree of the fits.
+    scheme : {"auto", "esdirk", "radau", "imex", "euler"}
+        "esdirk" (KenCarp4, order 4), "radau" (Radau IIA, order 5, for linear problems), "imex" (KenCarp4 with its
+        explicit half for what is nonlinear), "euler" (backward), or "auto": radau for linear problems of order 6
         and more, of second order in time, and with equations without a rate, esdirk for other linear ones; imex for
         semilinear ones, where only lower derivatives are nonlinear, and esdirk with Newton's method for the rest.
-    save : so many equal intervals, or an array of times; the start and the end alone if not given.
-    damping : for waves, a small multiple of what only the cloud sees: alpha / spacing times the rate minus its
-        prediction by the neighbours. "auto" is 0.1 at order 6 and above, 0 below; for pairs of fields that drive one
-        another by second derivatives, as in Schroedinger's equation, 0.2.
-    stencils : the user's, from :func:`jsmitsm.stencils`, which are not repaired; needed where JAX traces the points.
-    depth : degrees by which the recursion exceeds the order; "auto" is 0, since more gains nothing here.
-    throw : raise :class:`jsmitsm.SolveError` where the run cannot go on; otherwise return the last good state, with
-        ``converged`` False.
-    progress : a bar with the time and an estimate of the rest.
+    save : int or array_like, optional
+        So many equal intervals, or an array of times; the start and the end alone if not given.
+    damping : float or "auto"
+        For waves, a small multiple of what only the cloud sees: alpha / spacing times the rate minus its prediction
+        by the neighbours. "auto" is 0.1 at order 6 and above, 0 below; for pairs of fields that drive one another
+        by second derivatives, as in Schroedinger's equation, 0.2.
+    stencils : Stencils, optional
+        The user's, from ``js.stencils``, which are not repaired; needed where JAX traces the points.
+    depth : int or "auto"
+        Degrees by which the recursion exceeds the order; "auto" is 0, since more gains nothing here.
+    throw : bool
+        Raise ``js.SolveError`` where the run cannot go on; otherwise return the last good state, with ``converged``
+        False.
+    progress : bool
+        A bar with the time and an estimate of the rest.
+
+    Returns
+    -------
+    Evolution
+        The states at the saved times, and at any other by ``.at(t)``.
 
     Raises
     ------
@@ -99,8 +121,10 @@ def evolve(
     made = timed(problem, cloud)
     second = bool(made.masses[1].slots)
     start = starting_values(u0, cloud, problem.fields, second)
-    options = {"order": int(order), "scheme": scheme, "damping": damping, "stencils": stencils, "throw": throw,
-               "depth": 0 if depth == "auto" else depth}  # fmt: skip
+    options: dict[str, Any] = {
+        "order": int(order), "scheme": scheme, "damping": damping, "stencils": stencils, "throw": throw,
+        "depth": 0 if depth == "auto" else depth,
+    }  # fmt: skip
     run = Run(made, cloud, start, t, began, **options)
     if is_traced(t):
         if not (save is None or isinstance(save, int)):

@@ -7,14 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from jsmitsm.evolution import dense_output
-from jsmitsm.evolution.control import controlled
 from jsmitsm.evolution.estimate import estimated
 from jsmitsm.evolution.evolution import Evolution, Report
-from jsmitsm.evolution.local_fits import StateFit
 from jsmitsm.evolution.run import Run
-from jsmitsm.evolution.semidiscrete import local_fits
-from jsmitsm.evolution.stepping import Step, Stopped
+from jsmitsm.evolution.space.local_fits import StateFit
+from jsmitsm.evolution.space.semidiscrete import local_fits
+from jsmitsm.evolution.steps import dense_output
+from jsmitsm.evolution.steps.control import controlled
+from jsmitsm.evolution.steps.stepping import Step, Stopped
 from jsmitsm.runtime.errors import SolveError
 from jsmitsm.solution.fit import Recipe
 from jsmitsm.taylor.multi_indices import HIGHEST
@@ -196,7 +196,9 @@ class _Renewing:
         return self.inner.advance(last, t, h, estimate)
 
 
-def _finished(run: Run, parts: np.ndarray, history: History, fault: str, errors: list[float], began: float) -> Evolution:
+def _finished(
+    run: Run, parts: np.ndarray, history: History, fault: str, errors: list[float], began: float
+) -> Evolution:
     t0, t1 = (float(v) for v in run.t)
     times = np.where(parts >= 1.0, t1, t0 + parts * (t1 - t0))
     flags, told = run.flags, run.told

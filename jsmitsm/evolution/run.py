@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from contextlib import nullcontext
 from typing import Any
 
 import jax
@@ -14,12 +13,12 @@ from jsmitsm.discretization.coefficients import slot_series
 from jsmitsm.discretization.layout import discretize
 from jsmitsm.discretization.pencil.assemble import assemble_pencil
 from jsmitsm.equation.field import RATE
-from jsmitsm.evolution.convection import refuse_convection
-from jsmitsm.evolution.newton import Newton
-from jsmitsm.evolution.semidiscrete import Driver, Semidiscrete, local_fits
-from jsmitsm.evolution.stepping import RadauStepper, Stepper
-from jsmitsm.evolution.tableaux import EULER, KENCARP4, RADAU
-from jsmitsm.evolution.timed import Timed
+from jsmitsm.evolution.space.convection import refuse_convection
+from jsmitsm.evolution.space.semidiscrete import Driver, Semidiscrete, local_fits
+from jsmitsm.evolution.space.timed import Timed
+from jsmitsm.evolution.steps.newton import Newton
+from jsmitsm.evolution.steps.stepping import RadauStepper, Stepper
+from jsmitsm.evolution.steps.tableaux import EULER, KENCARP4, RADAU
 from jsmitsm.runtime.tracers import is_traced
 
 # A quasilinear problem is linearised anew where its coefficients have changed by this part of themselves.
@@ -44,10 +43,10 @@ class Run:
         self._fits: Any = None
         self.name = self._scheme(scheme)
         self.damping = self._damping(damping)
-        if self.traced and (timed.quasilinear or self.name in ("radau",)):
+        if self.traced and (timed.quasilinear or self.name == "radau"):
             raise ValueError(
-                'scheme: under a JAX transform js.evolve steps by "esdirk" and "euler" where the problem is linear, and '
-                'by "imex" where only lower derivatives are nonlinear'
+                'scheme: under a JAX transform js.evolve steps linear problems by "esdirk" and "euler", and by "imex" '
+                "those where only lower derivatives are nonlinear; others it does not do there"
             )
         self.semi = self.pencil(np.asarray(0.0) if self.traced else np.asarray(float(t[0])), start[0])
 
@@ -89,7 +88,7 @@ class Run:
 
     def _damping(self, asked: Any) -> float:
         """The factor of the damping matrix."""
-        operator = self.timed.problem.pde
+        operator = self.timed.operator
         coupled = not self.second and self.fields > 1 and all(
             not any(p and k == e and sum(b) == operator.order[e] for (k, b), p in zip(operator.slots, row))
             for e, row in enumerate(operator.pattern)
@@ -121,8 +120,7 @@ class Run:
         options: dict[str, Any] = {"order": self.order, "mass": massed, "stencils": self.stencils, "depth": self.depth}
         reference = None
         if not timed.quasilinear:
-            known = not is_traced(problem, self.cloud, timed.masses)
-            with jax.ensure_compile_time_eval() if known else nullcontext():  # under jit, too, what is known is computed
+            with jax.ensure_compile_time_eval():  # under jit, too, what is known is computed
                 pencil = assemble_pencil(problem, self.cloud, **options)
         else:
             problem.pde = timed.space  # type: ignore[assignment]
@@ -149,6 +147,7 @@ class Run:
     def drifted(self, y: Any, t: float) -> bool:
         """Whether the coefficients have left those that the pencil was made with."""
         semi, record = self.semi, self.timed.space
+        assert semi.reference is not None
         change = semi.steepness(semi.lifted(y, np.asarray(t)), t)
         for e, m in enumerate(record.order):
             top = [s for s, (_, b) in enumerate(record.slots) if record.pattern[e, s] and sum(b) == m]

@@ -60,7 +60,7 @@ def nested_dissection(rows: np.ndarray, cols: np.ndarray, points: np.ndarray) ->
 def spatial_order(points: np.ndarray) -> np.ndarray:
     """The unknowns region by region, neighbours near one another: for what sweeps over a matrix and eliminates nothing.
 
-    ``points`` and what comes back as for :func:`nested_dissection`, which takes eight times as long.
+    ``points`` and what comes back as for ``nested_dissection``, which takes eight times as long.
 
     Example:
       >>> spatial_order(np.array([[2.0], [0.0], [1.0]]))

@@ -30,17 +30,24 @@ LOOSE = 1e3
 class Modes:
     """Eigenvalues and modes of an operator, by their distance from what was asked for.
 
-    Attributes
-    ----------
-    values : (k,) eigenvalues; real, unless one has an imaginary part beyond its estimated error.
-    u : (N, k) the modes at the particles, (N, k, F) for a system. The mean of their square over the particles is 1, and
-        their largest value is positive.
-    converged : whether the values were found.
-    residuals : (k,) largest entries of A u - lambda B mass u, relative to those of A u's terms.
-    stats : seconds, and sizes.
 
     ``modes(j, points)`` evaluates mode j at points (M, D), ``modes.grad(j, points)`` its gradient: by local Taylor
+
     polynomials, which satisfy L u = lambda mass u. ``js.plot.values(cloud, modes.u[:, j])`` draws it.
+
+    Attributes
+    ----------
+    values : array (k,)
+        (k,) eigenvalues; real, unless one has an imaginary part beyond its estimated error.
+    u : array (N, k) or (N, k, F)
+        (N, k) the modes at the particles, (N, k, F) for a system. The mean of their square over the particles is 1,
+        and their largest value is positive.
+    converged : bool
+        Whether the values were found.
+    residuals : array (k,)
+        (k,) largest entries of A u - lambda B mass u, relative to those of A u's terms.
+    stats : dict
+        Seconds, and sizes.
 
     Examples
     --------
@@ -80,15 +87,107 @@ class Modes:
         return int(np.shape(self._values)[-1])
 
     def __call__(self, k: int, points: ArrayLike, *, blend: bool = False, outside: str = "nan") -> jax.Array:
-        """Mode k at ``points`` (M, D): (M,), or (M, F) for a system; ``blend`` and ``outside`` as for a Solution."""
+        """A mode anywhere.
+
+        Parameters
+        ----------
+        k : int
+            Its number.
+        points : array_like (M, D)
+            Where.
+        blend, outside : optional
+            As for ``js.Solution``.
+
+        Returns
+        -------
+        jax.Array
+            (M,), for a system (M, F).
+
+        Raises
+        ------
+        ValueError
+            For other numbers, complex modes, and points of another shape.
+
+        Examples
+        --------
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import jsmitsm as js
+        >>> ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(0.0)}
+        >>> string = js.Problem(lambda u, x: -js.laplacian(u)(x), ends)
+        >>> modes = js.eigen(string, js.interval(0.0, 1.0, 41), 2)
+        >>> bool(abs(modes(1, [[0.5]])[0]) < 1e-4)
+        True
+        """
         return self._between(k)(points, blend=blend, outside=outside)
 
     def grad(self, k: int, points: ArrayLike, *, blend: bool = False, outside: str = "nan") -> jax.Array:
-        """The gradient of mode k at ``points`` (M, D): (M, D), or (M, F, D) for a system."""
+        """The gradient of a mode anywhere.
+
+        Parameters
+        ----------
+        k : int
+            Its number.
+        points : array_like (M, D)
+            Where.
+        blend, outside : optional
+            As for ``js.Solution``.
+
+        Returns
+        -------
+        jax.Array
+            (M, D), for a system (M, F, D).
+
+        Raises
+        ------
+        ValueError
+            For other numbers, complex modes, and points of another shape.
+
+        Examples
+        --------
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import jsmitsm as js
+        >>> ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(0.0)}
+        >>> string = js.Problem(lambda u, x: -js.laplacian(u)(x), ends)
+        >>> modes = js.eigen(string, js.interval(0.0, 1.0, 41), 2)
+        >>> bool(abs(modes.grad(0, [[0.5]])[0, 0]) < 1e-4)
+        True
+        """
         return self._between(k).grad(points, blend=blend, outside=outside)
 
     def derivative(self, k: int, points: ArrayLike, multi_index: Sequence[int], *, outside: str = "nan") -> jax.Array:
-        """The derivative d^b of mode k at ``points`` (M, D), b = ``multi_index``: (M,) or (M, F)."""
+        """Any derivative d^b of a mode anywhere.
+
+        Parameters
+        ----------
+        k : int
+            Its number.
+        points : array_like (M, D)
+            Where.
+        multi_index : sequence of int (D,)
+            b, the order along each axis.
+        outside : optional
+            As for ``js.Solution``.
+
+        Returns
+        -------
+        jax.Array
+            (M,), for a system (M, F).
+
+        Raises
+        ------
+        ValueError
+            For other numbers, complex modes, wrong points or orders.
+
+        Examples
+        --------
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import jsmitsm as js
+        >>> ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(0.0)}
+        >>> string = js.Problem(lambda u, x: -js.laplacian(u)(x), ends)
+        >>> modes = js.eigen(string, js.interval(0.0, 1.0, 41), 2)
+        >>> round(float(modes.derivative(0, [[0.5]], (2,))[0] / modes(0, [[0.5]])[0]), 3)
+        -9.87
+        """
         return self._between(k).derivative(points, multi_index, outside=outside)
 
     def _between(self, k: Any) -> Solution:
@@ -147,10 +246,29 @@ class Modes:
         return self._found
 
     def error_estimate(self) -> np.ndarray:
-        """Estimated errors (k,) of the values, by the pencil of order p + 2, assembled when first asked for.
+        """Estimated errors of the values, by the pencil of order p + 2, assembled when first asked for.
 
-        For values of a cluster that of the cluster. Infinite where there is no other order to compare with. Raises
-        ValueError for modes that were made under a JAX transform, or pickled.
+        For values of a cluster that of the cluster. Infinite where there is no other order to compare with.
+
+        Returns
+        -------
+        array (k,)
+            In units of the values.
+
+        Raises
+        ------
+        ValueError
+            For modes that were made under a JAX transform, or pickled.
+
+        Examples
+        --------
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import jsmitsm as js
+        >>> ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(0.0)}
+        >>> string = js.Problem(lambda u, x: -js.laplacian(u)(x), ends)
+        >>> modes = js.eigen(string, js.interval(0.0, 1.0, 41), 2)
+        >>> bool((modes.error_estimate() < 1e-6 * modes.values).all())
+        True
         """
         if self._errors is None:
             found = self._host("error_estimate")
@@ -204,7 +322,23 @@ class Modes:
         return self.error_estimate() / np.where(size > 0, size, 1.0)
 
     def diagnose(self) -> str:
-        """In words: how well the values are known, which are multiple, and what was repaired."""
+        """In words: how well the values are known, which are multiple, and what was repaired.
+
+        Returns
+        -------
+        str
+            Several lines; those that begin with FLAG speak against the modes.
+
+        Examples
+        --------
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import jsmitsm as js
+        >>> ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(0.0)}
+        >>> string = js.Problem(lambda u, x: -js.laplacian(u)(x), ends)
+        >>> modes = js.eigen(string, js.interval(0.0, 1.0, 41), 2)
+        >>> "FLAG" in modes.diagnose()
+        False
+        """
         lines = [repr(self)]
         lines += [f"FLAG: {line}" for line in self.flags]
         if not np.all(self.converged):

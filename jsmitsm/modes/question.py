@@ -133,7 +133,7 @@ def _sampled(problem: Problem, cloud: Cloud, mass: Callable[..., Any]) -> Any:
 def mass_at(problem: Problem, mass: Any, x: Any) -> Any:
     """The mass at a point: scalar or (F,)."""
     if mass is None or not callable(mass):
-        return 1.0 if mass is None else mass
+        return 1.0 if mass is None else jnp.asarray(mass)
     return mass(x, problem.params) if problem.params is not None and _takes_params(mass) else mass(x)
 
 

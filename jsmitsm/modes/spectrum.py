@@ -276,19 +276,21 @@ def _jvp(primals: Sequence[Any], tangents: Sequence[Any], **given: Any) -> tuple
     slope = mean @ jnp.einsum("nk,nk->k", left, moved)
     turned = times(da, p.cols_a, p.rows_a, left) - values * times(dc, p.cols_c, p.rows_c, left)
     cv, cy = times(c, p.rows_c, p.cols_c, right), times(c, p.cols_c, p.rows_c, left)
-    n, last, every = p.n, np.full(p.n, p.n), np.arange(p.n)
+    n, last, every, whole = p.n, np.full(p.n, p.n), np.arange(p.n), np.arange(p.n + 1)
     d_right, d_left = [], []
     for k in range(given["count"]):
-        # Vectors of a cluster turn freely among themselves: no derivative, and a matrix without an inverse.
-        one = jnp.where(mean[k, k] > 0.99, 1.0, jnp.nan)
-        inner = jnp.concatenate([a * one, -values[k] * c])
+        # Vectors of a cluster turn freely among themselves: they have no derivative, their matrix no inverse.
+        simple = mean[k, k] > 0.99
+        inner = jnp.where(simple, jnp.concatenate([a, -values[k] * c]), 0.0)
         rows, cols = np.concatenate([p.rows_a, p.rows_c]), np.concatenate([p.cols_a, p.cols_c])
         points = None if p.points is None else np.concatenate([p.points, np.full((1, p.points.shape[1]), np.nan)])
 
-        def bordered(rows, cols, column, row, right_side, inner=inner, points=points):
-            data = jnp.concatenate([inner, column, row])
-            at = np.concatenate([rows, every, last]), np.concatenate([cols, last, every])
-            return linsolve.solve(data, *at, right_side, n=n + 1, points=points, elliptic=False)[:n]
+        def bordered(rows, cols, column, row, right_side, inner=inner, points=points, simple=simple):
+            border = jnp.where(simple, jnp.concatenate([column, row]), 0.0)
+            data = jnp.concatenate([inner, border, jnp.where(simple, 0.0, jnp.ones(n + 1))])
+            at = np.concatenate([rows, every, last, whole]), np.concatenate([cols, last, every, whole])
+            found = linsolve.solve(data, *at, right_side, n=n + 1, points=points, elliptic=False)[:n]
+            return jnp.where(simple, found, jnp.nan)
 
         dv = bordered(rows, cols, -cv[:, k], right[:, k], jnp.append(-moved[:, k], 0.0))
         scale = left[:, k] @ times(dc, p.rows_c, p.cols_c, right[:, k : k + 1])[:, 0] + cy[:, k] @ dv

@@ -154,7 +154,7 @@ def _in_order(matrix: Any, *parts: np.ndarray) -> Any:
 
 def _row_lengths(matrix: Any, xp: Any) -> Any:
     """The lengths of the deep parts of rows of unit length; where they are only rounding, none of it counts."""
-    return xp.maximum(xp.sqrt(xp.sum(matrix**2, axis=1)), FAINT)
+    return xp.sqrt(xp.maximum(xp.sum(matrix**2, axis=1), FAINT**2))
 
 
 def _ridge(scheme: Scheme) -> float:
@@ -192,7 +192,7 @@ def unconstrained(scheme: Scheme) -> tuple[Scheme, Elimination]:
 
 
 def eliminate_on_host(scheme: Scheme, jac: np.ndarray, length: float = 1.0) -> Elimination:
-    """:func:`eliminate` in numpy, where one elimination serves many particles; kept for later."""
+    """``eliminate`` in numpy, where one elimination serves many particles; kept for later."""
     bare = Scheme(scheme.method, scheme.rec, scheme.free, scheme.dependent, flat=scheme.flat)
     return _eliminated_once(bare, jac.tobytes(), jac.shape, jac.dtype.str, length)
 

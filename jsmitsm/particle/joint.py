@@ -99,7 +99,7 @@ def _in_size_class(function: Any) -> Any:
 
 @_in_size_class
 def joint_rows(scheme: JointScheme, points: Any, sides: tuple[Side, ...], coef: Any, more: Any = ()) -> tuple[Row, ...]:
-    """The equations of all copies of n joints, a :class:`Row` for every side with the joint's axis first.
+    """The equations of all copies of n joints, a ``Row`` for every side with the joint's axis first.
 
     Their weights run over the neighbours of all sides, one side after the other; ``source`` over the rows of all
     sides' recursions, ``condition`` over the conditions between the copies, whose coefficients are ``coef``
@@ -119,7 +119,7 @@ def joint_coefficients(scheme: JointScheme, points: Any, sides: tuple[Side, ...]
     """Taylor coefficients (n, F, K) of the copies on every side.
 
     more: the values (N_s, F) of every side's particles; source (n, rows of all) and given (n, conditions) as the rows
-    of :func:`joint_rows` have them.
+    of ``joint_rows`` have them.
     """
 
     data, source, given = more

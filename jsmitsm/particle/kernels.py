@@ -26,11 +26,15 @@ class Kernel:
 
     Parameters
     ----------
-    profile : function r -> weight of a scalar scaled distance, written in ``jax.numpy``;
-        with ``params`` it is called as ``profile(r, params)``.
-    h : smoothing length in length units, a positive scalar or an (N,) array, one per particle.
-    d : dimensionless support radius; a particle has the neighbours |x - x_i| <= d h.
-    params : any pytree of numbers, further parameters of the profile.
+    profile : function
+        Function r -> weight of a scalar scaled distance, written in ``jax.numpy``; with ``params`` it is called as
+        ``profile(r, params)``.
+    h : float or array_like (N,)
+        Smoothing length in length units, a positive scalar or an (N,) array, one per particle.
+    d : float
+        Dimensionless support radius; a particle has the neighbours |x - x_i| <= d h.
+    params : pytree, optional
+        Any pytree of numbers, further parameters of the profile.
 
     Raises
     ------
@@ -63,11 +67,45 @@ class Kernel:
         self.d: float | jax.Array = _checked(d, "d", (0,))
 
     def profile(self, r: Any) -> jax.Array:
-        """The weight at the scaled distance ``r``, before the support cuts it off."""
+        """The weight before the support cuts it off.
+
+        Parameters
+        ----------
+        r : array_like
+            Scaled distances |x - x_i| / h, of any shape.
+
+        Returns
+        -------
+        jax.Array
+            Of the shape of ``r``.
+
+        Examples
+        --------
+        >>> import jsmitsm as js
+        >>> float(js.Wendland(h=0.1, d=2.0).profile(0.0))
+        1.0
+        """
         return self._profile(r) if self.params is None else self._profile(r, self.params)
 
     def weight(self, r: Any) -> jax.Array:
-        """The weight at the scaled distance ``r`` (any shape), zero outside the support."""
+        """The weight, zero outside the support.
+
+        Parameters
+        ----------
+        r : array_like
+            Scaled distances |x - x_i| / h, of any shape.
+
+        Returns
+        -------
+        jax.Array
+            Of the shape of ``r``.
+
+        Examples
+        --------
+        >>> import jsmitsm as js
+        >>> float(js.Constant(h=0.1, d=2.0).weight(2.5))
+        0.0
+        """
         return jnp.where(r <= self.d * EDGE, self.profile(r), 0.0)
 
     def recorded(self) -> Kernel:
@@ -91,11 +129,50 @@ class Kernel:
         return self.h * xp.minimum(self.d, 2.0)
 
     def at(self, i: Any) -> Kernel:
-        """The kernel of particle ``i``: its own smoothing length where there is one per particle."""
+        """The kernel of one particle: its own smoothing length where there is one per particle.
+
+        Parameters
+        ----------
+        i : int
+            Number of the particle.
+
+        Returns
+        -------
+        Kernel
+            With a scalar ``h``.
+
+        Examples
+        --------
+        >>> import jsmitsm as js
+        >>> js.Gaussian(h=[0.1, 0.2], d=2.0).at(1)
+        Gaussian(h=0.2, d=2)
+        """
         return self.replace(h=cast(Array, self.h)[i]) if jnp.ndim(self.h) else self
 
     def replace(self, **changes: Any) -> Kernel:
-        """The same kernel with other ``changes``: ``h``, ``d`` or ``params``; ValueError for other names."""
+        """The same kernel with other numbers.
+
+        Parameters
+        ----------
+        **changes : any
+            ``h``, ``d`` or ``params``.
+
+        Returns
+        -------
+        Kernel
+            A new one; this one stays.
+
+        Raises
+        ------
+        ValueError
+            For other names, and numbers that are not positive and finite.
+
+        Examples
+        --------
+        >>> import jsmitsm as js
+        >>> js.Gaussian(h=0.1, d=2.0).replace(h=0.3)
+        Gaussian(h=0.3, d=2)
+        """
         unknown = sorted(set(changes) - {"h", "d", "params"})
         if unknown:
             raise ValueError(f"{unknown[0]}: no parameter of {type(self).__name__}; it has 'h', 'd' and 'params'"
@@ -135,8 +212,17 @@ class SuperGaussian(_Named):
     r"""The revised super Gauss function, W(r) = (d^2 - r^2) exp(-r^2) for r <= d.
 
     Karamanli (2015), eq. (30) and (35). Its factor G / (h sqrt(pi))^D with G = 1.04823, 1.10081,
-    1.18516 for D = 1, 2, 3 is :meth:`normalization`; it cancels from every moment system.
+    1.18516 for D = 1, 2, 3 is ``normalization``; it cancels from every moment system.
 
+    Parameters
+    ----------
+    h : float or array (N,)
+        Smoothing length, length units.
+    d : float
+        Support radius in smoothing lengths.
+
+    Examples
+    --------
     >>> import jsmitsm as js
     >>> round(float(js.SuperGaussian(h=0.1, d=2.0).profile(0.0)), 3)
     4.0
@@ -146,7 +232,29 @@ class SuperGaussian(_Named):
         return (self.d**2 - r**2) * jnp.exp(-(r**2))
 
     def normalization(self, dim: int) -> float | Array:
-        """The constant G / (h sqrt(pi))^D of eq. (30), ``dim`` = D; ValueError unless that is 1, 2 or 3."""
+        """The constant G / (h sqrt(pi))^D of eq. (30).
+
+        Parameters
+        ----------
+        dim : int
+            D, the number of space dimensions.
+
+        Returns
+        -------
+        float or array (N,)
+            Of the shape of ``h``.
+
+        Raises
+        ------
+        ValueError
+            Unless ``dim`` is 1, 2 or 3.
+
+        Examples
+        --------
+        >>> import jsmitsm as js
+        >>> round(float(js.SuperGaussian(h=1.0, d=2.0).normalization(2)), 4)
+        0.3504
+        """
         if dim not in (1, 2, 3):
             raise ValueError(f"dim: expected 1, 2 or 3 dimensions, got {dim!r}")
         return (1.04823, 1.10081, 1.18516)[dim - 1] / (self.h * np.sqrt(np.pi)) ** dim
@@ -156,6 +264,15 @@ class SuperGaussian(_Named):
 class Gaussian(_Named):
     """W(r) = exp(-r^2) for r <= d.
 
+    Parameters
+    ----------
+    h : float or array (N,)
+        Smoothing length, length units.
+    d : float
+        Support radius in smoothing lengths.
+
+    Examples
+    --------
     >>> import jsmitsm as js
     >>> float(js.Gaussian(h=0.1, d=2.0).weight(0.0))
     1.0
@@ -176,6 +293,15 @@ class Wendland(_Named):
 
     H. Wendland, Adv. Comput. Math. 4 (1995) 389-396.
 
+    Parameters
+    ----------
+    h : float or array (N,)
+        Smoothing length, length units.
+    d : float
+        Support radius in smoothing lengths.
+
+    Examples
+    --------
     >>> import jsmitsm as js
     >>> float(js.Wendland(h=0.1, d=2.0).weight(2.0))
     0.0
@@ -193,6 +319,15 @@ class CubicSpline(_Named):
     W = 1 - 6 q^2 + 6 q^3 for q = r / d <= 1/2, and 2 (1 - q)^3 up to q = 1.
     J. J. Monaghan and J. C. Lattanzio, Astron. Astrophys. 149 (1985) 135-143.
 
+    Parameters
+    ----------
+    h : float or array (N,)
+        Smoothing length, length units.
+    d : float
+        Support radius in smoothing lengths.
+
+    Examples
+    --------
     >>> import jsmitsm as js
     >>> float(js.CubicSpline(h=0.1, d=2.0).weight(1.0))
     0.25
@@ -207,6 +342,15 @@ class CubicSpline(_Named):
 class Constant(_Named):
     """W = 1 inside the support. Its derivatives vanish: methods II and III need another kernel.
 
+    Parameters
+    ----------
+    h : float or array (N,)
+        Smoothing length, length units.
+    d : float
+        Support radius in smoothing lengths.
+
+    Examples
+    --------
     >>> import jsmitsm as js
     >>> float(js.Constant(h=0.1, d=2.0).weight(1.9))
     1.0

@@ -136,15 +136,20 @@ def local_system(
         z, own_solve = null_space(own_rows @ basis)
         basis = basis @ z
         tests = None if tests is None else tests @ z
-    low = fit_and_tail(rec)[0]
-    fitted_values: Any = values
-    if scheme.flat and rec.depth:
-        short = plain and len(low) <= FEW
-        fitted_values, basis_fit = Combinations(near.offset, rec.order) if short else values[:, low], basis[low]
-    else:
-        basis_fit = basis
-    phi = fitted_values @ basis_fit if isinstance(fitted_values, Combinations) else product(fitted_values, basis_fit)
+    phi = _data_of(scheme, near, values, basis, plain)
     return System(solution, basis, own_rows, own_scale, own_solve, values, phi, weights, tests, data_scale)
+
+
+def _data_of(scheme: Scheme, near: Support, values: Any, basis: Any, plain: bool) -> Any:
+    """The data (rows of data, free) of the local solutions; those that end with the fit are looked at no further.
+
+    plain: whether the data are the neighbours' values of one field.
+    """
+    if scheme.flat and scheme.rec.depth:
+        low = fit_and_tail(scheme.rec)[0]
+        values = Combinations(near.offset, scheme.rec.order) if plain and len(low) <= FEW else values[:, low]
+        basis = basis[low]
+    return values @ basis if isinstance(values, Combinations) else product(values, basis)
 
 
 def moment_matrix(system: System) -> Any:

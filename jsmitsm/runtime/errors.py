@@ -19,12 +19,22 @@ _LONGEST = 200  # letters of a value that a message quotes
 class SolveError(RuntimeError):
     """A solve that failed: a singular system, values that are not finite, no convergence.
 
-    Attributes:
-      particles: indices of the particles at fault, the worst first; empty where none can be named.
+    Parameters
+    ----------
+    message : str
+        What went wrong and what to do.
+    particles : sequence of int
+        Those at fault.
 
-    Example:
-      >>> str(SolveError("the system is singular at particle 3", particles=[3]))
-      'the system is singular at particle 3'
+    Attributes
+    ----------
+    particles : tuple of int
+        The particles at fault, the worst first; empty where none can be named.
+
+    Examples
+    --------
+    >>> str(SolveError("the system is singular at particle 3", particles=[3]))
+    'the system is singular at particle 3'
     """
 
     def __init__(self, message: str, particles: Sequence[int] = ()) -> None:

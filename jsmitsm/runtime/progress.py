@@ -1,7 +1,7 @@
 """One progress bar for what takes long, where someone is watching.
 
 Shown after the first seconds, on a terminal or in a notebook, if tqdm is installed; never in
-pipes or under pytest. Off for a block with :func:`no_progress`, for a process with the
+pipes or under pytest. Off for a block with ``js.no_progress``, for a process with the
 environment variable ``TQDM_DISABLE=1``.
 
 There is one bar at a time: what opens a bar inside of another's becomes a stage that the outer one
@@ -110,6 +110,11 @@ _shown: ContextVar[Any] = ContextVar("shown", default=None)
 @contextmanager
 def no_progress() -> Iterator[None]:
     """No progress bars inside this block.
+
+    Returns
+    -------
+    context manager
+        For a ``with`` statement.
 
     Examples
     --------

@@ -15,8 +15,15 @@ _EXTRAS = ("matplotlib", "meshio", "shapely", "pandas", "xarray", "pyamg", "pypa
 def show_versions(file: TextIO | None = None) -> None:
     """Print the versions of jsmitsm, Python and the libraries, the devices and the precision.
 
-    Paste it into a report of a fault. ``file``: where to print, standard output if not given.
+    Paste it into a report of a fault.
 
+    Parameters
+    ----------
+    file : text file, optional
+        Where to print, standard output if not given.
+
+    Examples
+    --------
     >>> import jsmitsm as js
     >>> js.show_versions()  # doctest: +ELLIPSIS
     jsmitsm      ...

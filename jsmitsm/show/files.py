@@ -21,6 +21,7 @@ from jsmitsm.cloud.triangulation import simplices
 from jsmitsm.runtime.errors import refuse_masked
 from jsmitsm.show.mesh_cloud import cloud_of
 from jsmitsm.show.mesh_files import needed, read_mesh
+from jsmitsm.show.mesh_regions import regions_of
 from jsmitsm.solution.solution import Solution
 
 __all__ = ["from_csv", "from_mesh", "from_shapely", "to_csv", "to_mesh", "to_pandas", "to_xarray"]
@@ -29,27 +30,33 @@ _AXES = "xyz"
 _CELLS = {1: "line", 2: "triangle", 3: "tetra"}
 
 
-def from_mesh(mesh: Any, tags: str | None = None) -> Cloud:
+def from_mesh(mesh: Any, tags: str | None = None, *, regions: bool | list[str] = False) -> Cloud:
     """The nodes of a mesh as particles, boundary groups from its physical tags, normals from its boundary facets.
 
     Parameters
     ----------
-    mesh : a ``meshio.Mesh``, or the path of a file: SU2 and Abaqus or CalculiX (.inp), what meshio reads besides
+    mesh : meshio.Mesh or path
+        A ``meshio.Mesh``, or the path of a file: SU2 and Abaqus or CalculiX (.inp), what meshio reads besides
         (Gmsh, VTK, XDMF, ...). Lines, triangles, quadrilaterals, tetrahedra, hexahedra, wedges and pyramids, of
-        first and of second order. The cells of the highest dimension are the domain; nodes that none of them uses are
-        dropped.
-    tags : the name of the cell data that hold the groups; found by itself for Gmsh (``gmsh:physical``, names
-        from its physical groups), Medit and others, whose groups are cell sets or point sets. Or a list of the names
-        of groups: those alone, the first first.
+        first and of second order. The cells of the highest dimension are the domain; nodes that none of them uses
+        are dropped.
+    tags : str or list of str, optional
+        The name of the cell data that hold the groups; found by itself for Gmsh (``gmsh:physical``, names from its
+        physical groups), Medit and others, whose groups are cell sets or point sets. Or a list of the names of
+        groups: those alone, the first first.
+    regions : bool or sequence of str
+        True, or the names of the cells' tags in their order: a cloud of several regions, see ``js.regions``. Nodes
+        between two of them are copied, and their normals are those of the facets there.
 
     Returns
     -------
-    Cloud : groups ``"interior"`` and one for every tag of boundary facets and every set of boundary nodes. A node of
-        several belongs to the one named first, but a set that holds another whole comes after it, and none goes away
-        empty-handed; a boundary node of none belongs to ``"boundary"``. Normals are those of the group's
+    Cloud
+        Groups ``"interior"`` and one for every tag of boundary facets and every set of boundary nodes. A node of
+        several belongs to the one named first, but a set that holds another whole comes after it, and none goes
+        away empty-handed; a boundary node of none belongs to ``"boundary"``. Normals are those of the group's
         facets, averaged by angle: on curved sides as exact as the facets follow them (those of second order are
-        parabolas); ``cloud.replace(normals=...)`` takes better ones. What has a name and is no side (materials, lines
-        inside, sets that reach inside) is in ``cloud.cell_groups``: indices by name, which may overlap.
+        parabolas); ``cloud.replace(normals=...)`` takes better ones. What has a name and is no side (materials,
+        lines inside, sets that reach inside) is in ``cloud.cell_groups``: indices by name, which may overlap.
 
     Raises
     ------
@@ -61,6 +68,8 @@ def from_mesh(mesh: Any, tags: str | None = None) -> Cloud:
         for a domain that touches itself in a point or an edge; for a group without a node of its own, and tags that do
         not exist or name nothing. Which way round the nodes of a cell run does not matter.
 
+    Examples
+    --------
     >>> import meshio, numpy as np, jsmitsm as js
     >>> corners = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0.5, 0.5, 0]]
     >>> mesh = meshio.Mesh(corners, [("triangle", [[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]]),
@@ -73,6 +82,8 @@ def from_mesh(mesh: Any, tags: str | None = None) -> Cloud:
         mesh = read_mesh(mesh)
     if not all(hasattr(mesh, name) for name in Mesh._fields):
         raise ValueError(f"mesh: expected a meshio.Mesh or the path of a mesh file, got {type(mesh).__name__}")
+    if regions is not False:
+        return regions_of(mesh, _tag_key(tags)[0], None if regions is True else list(regions))
     return cloud_of(mesh, *_tag_key(tags))
 
 
@@ -86,12 +97,28 @@ def _tag_key(tags: Any) -> tuple[str | None, list[str] | None]:
 
 
 def from_shapely(polygon: Any, spacing: Any, seed: int = 0, groups: Any = None) -> Cloud:
-    """Particles of a shapely ``Polygon`` with its holes; everything else as in :func:`jsmitsm.from_polygon`.
+    """Particles of a shapely ``Polygon`` with its holes; see ``js.from_polygon``.
 
-    ``spacing``, ``seed`` and ``groups`` as there. ``polygon`` may also be its well-known text (which needs shapely:
-    ``pip install "jsmitsm[mesh]"``). Raises ValueError for other geometries; the parts of a ``MultiPolygon`` are solved
-    one by one.
+    Parameters
+    ----------
+    polygon : shapely.Polygon or str
+        Or its well-known text, which needs shapely: ``pip install "jsmitsm[mesh]"``. The parts of a
+        ``MultiPolygon`` are solved one by one.
+    spacing, seed, groups : optional
+        As for ``js.from_polygon``.
 
+    Returns
+    -------
+    Cloud
+        Groups ``"boundary"`` and ``"hole0"``, ... unless ``groups`` names them.
+
+    Raises
+    ------
+    ValueError
+        For other geometries, and empty ones.
+
+    Examples
+    --------
     >>> import shapely, jsmitsm as js
     >>> sorted(js.files.from_shapely(shapely.box(0, 0, 2, 1).difference(shapely.Point(1, 0.5).buffer(0.2)), 0.1).groups)
     ['boundary', 'hole0', 'interior']
@@ -114,12 +141,28 @@ def from_shapely(polygon: Any, spacing: Any, seed: int = 0, groups: Any = None) 
 
 
 def from_csv(path: Any) -> Cloud:
-    """A cloud from a CSV file with a header: columns ``x`` (``y``, ``z``) and ``group``; normals in ``nx`` (``ny``,
-    ``nz``) where there are any, empty in the interior. Other columns are ignored. :func:`to_csv` writes such files.
+    """A cloud from a CSV file with a header; ``js.files.to_csv`` writes such files.
 
-    Raises ValueError for a column that is missing or comes twice, and a cell that is no number, with its line.
-    ``path``: a name or a path.
+    Columns ``x`` (``y``, ``z``) and ``group``; normals in ``nx`` (``ny``, ``nz``) where there are any, empty in the
+    interior. Other columns are ignored.
 
+    Parameters
+    ----------
+    path : str or path
+        The file.
+
+    Returns
+    -------
+    Cloud
+        With the groups of the file.
+
+    Raises
+    ------
+    ValueError
+        For a column that is missing or comes twice, and a cell that is no number, with its line.
+
+    Examples
+    --------
     >>> import os, tempfile, jsmitsm as js
     >>> path = os.path.join(tempfile.mkdtemp(), "cloud.csv")
     >>> js.files.to_csv(js.interval(0.0, 1.0, 3), path)
@@ -170,8 +213,24 @@ def from_csv(path: Any) -> Cloud:
 def to_csv(what: Cloud | Solution, path: Any) -> None:
     """Write a cloud, or a solution with its cloud, as CSV: coordinates, group, normals and the values ``u``.
 
-    ``what``: a cloud or a solution; ``path``: a name or a path. Numbers are written so that they read back to the
-    last bit, see :func:`from_csv`; cell groups are not written.
+    Numbers are written so that they read back to the last bit; cell groups are not written.
+
+    Parameters
+    ----------
+    what : Cloud or Solution
+        What is written.
+    path : str or path
+        The file; one that exists is overwritten.
+
+    Raises
+    ------
+    ValueError
+        For groups whose names would not read back, and a file that cannot be written.
+
+    Examples
+    --------
+    >>> import os, tempfile, jsmitsm as js
+    >>> js.files.to_csv(js.interval(0.0, 1.0, 3), os.path.join(tempfile.mkdtemp(), "cloud.csv"))
     """
     columns = _columns(_a_kind(what, (Cloud, Solution), "what"))
     for name in set(columns["group"]):
@@ -188,12 +247,29 @@ def to_csv(what: Cloud | Solution, path: Any) -> None:
 
 
 def to_mesh(sol: Solution, **more: Any) -> Any:
-    """The solution on a mesh of triangles (lines, tetrahedra) between its particles, a ``meshio.Mesh``.
+    """The solution on a mesh of triangles (lines, tetrahedra) between its particles; holes stay open.
 
-    ``to_mesh(sol).write("u.vtu")`` makes a file for ParaView. ``more``: further point data (N,) or (N, F), as in
-    ``to_mesh(sol, estimate=sol.error_estimate())``. Holes stay open. Raises ValueError for data
-    of another length. Needs meshio: ``pip install "jsmitsm[mesh]"``.
+    ``to_mesh(sol).write("u.vtu")`` makes a file for ParaView. Needs meshio: ``pip install "jsmitsm[mesh]"``.
 
+    Parameters
+    ----------
+    sol : Solution
+        What is written.
+    **more : array_like (N,) or (N, F)
+        Further point data, as in ``to_mesh(sol, estimate=sol.error_estimate())``.
+
+    Returns
+    -------
+    meshio.Mesh
+        With ``u`` as point data.
+
+    Raises
+    ------
+    ValueError
+        For data of another length.
+
+    Examples
+    --------
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jsmitsm as js
     >>> ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(1.0)}
@@ -216,11 +292,29 @@ def to_mesh(sol: Solution, **more: Any) -> Any:
 
 
 def to_pandas(what: Cloud | Solution, **more: Any) -> Any:
-    """``what``, a cloud or a solution with its cloud, as a ``pandas.DataFrame``: one row per particle, coordinates,
-    group, normals, and ``u`` (``u0``, ``u1``, ... for a system). ``more``: further columns (N,).
+    """A cloud, or a solution with its cloud, as a table of one row per particle.
 
     Needs pandas: ``pip install "jsmitsm[tables]"``.
 
+    Parameters
+    ----------
+    what : Cloud or Solution
+        What is written.
+    **more : array_like (N,)
+        Further columns.
+
+    Returns
+    -------
+    pandas.DataFrame
+        Coordinates, group, normals, and ``u`` (``u0``, ``u1``, ... for a system).
+
+    Raises
+    ------
+    ValueError
+        For columns of another length or of a name that is taken.
+
+    Examples
+    --------
     >>> import jsmitsm as js
     >>> js.files.to_pandas(js.interval(0.0, 1.0, 3)).group.tolist()
     ['left', 'interior', 'right']
@@ -230,11 +324,29 @@ def to_pandas(what: Cloud | Solution, **more: Any) -> Any:
 
 
 def to_xarray(sol: Solution, **more: Any) -> Any:
-    """A solution as an ``xarray.Dataset`` over the dimension ``particle`` (and ``field`` for a system), with the
-    coordinates and groups as coordinates, method and order as attributes. ``more``: further variables (N,).
+    """A solution as a data set over the dimension ``particle`` (and ``field`` for a system).
 
     Needs xarray: ``pip install "jsmitsm[tables]"``.
 
+    Parameters
+    ----------
+    sol : Solution
+        What is written.
+    **more : array_like (N,)
+        Further variables.
+
+    Returns
+    -------
+    xarray.Dataset
+        Coordinates and groups as coordinates, method and order as attributes.
+
+    Raises
+    ------
+    ValueError
+        For variables of another length or of a name that is taken.
+
+    Examples
+    --------
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jsmitsm as js
     >>> ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(1.0)}

@@ -35,7 +35,7 @@ class _Named(NamedTuple):
 
 
 def cloud_of(mesh: Any, key: str | None, names: list[str] | None) -> Cloud:
-    """The cloud of a ``meshio.Mesh``; see :func:`jsmitsm.files.from_mesh`."""
+    """The cloud of a ``meshio.Mesh``; see ``js.files.from_mesh``."""
     dim, blocks = volume_cells(mesh.cells)
     points = _checked_nodes(mesh.points, dim)
     check_cells(len(points), [(block.type, block.data) for block in mesh.cells if len(block.data)])

@@ -31,13 +31,24 @@ def cloud(what: Cloud | Solution, *, normals: bool = False, support: int | None 
 
     Parameters
     ----------
-    what : a :class:`jsmitsm.Cloud` or a :class:`jsmitsm.Solution`, whose cloud is taken.
-    normals : draw the boundary's normals.
-    support : a particle whose support is shown: its neighbours are ringed, and with ``kernel`` the
-        ball |x - x_i| <= d h is drawn.
-    kernel, stencils : where the support comes from; a Solution brings its own neighbours.
-    legend : name the groups and count their particles.
-    ax : axes to draw on; in 3D they need ``projection="3d"``.
+    what : Cloud or Solution
+        A ``js.Cloud`` or a ``js.Solution``, whose cloud is taken.
+    normals : bool
+        Draw the boundary's normals.
+    support : int, optional
+        A particle whose support is shown: its neighbours are ringed, and with ``kernel`` the ball |x - x_i| <= d h
+        is drawn.
+    kernel, stencils : Kernel, Stencils, optional
+        Where the support comes from; a Solution brings its own neighbours.
+    legend : bool
+        Name the groups and count their particles.
+    ax : Axes, optional
+        Axes to draw on; in 3D they need ``projection="3d"``.
+
+    Returns
+    -------
+    Axes
+        What it was drawn on.
 
     Raises
     ------
@@ -89,22 +100,30 @@ def solution(sol: Solution, *, field: int = 0, exact: Any = None, at: Mapping[st
 
     Parameters
     ----------
-    sol : a :class:`jsmitsm.Solution`.
-    field : the field of a system.
-    exact : 1D only: the exact solution to draw beside it, a function of one point x (1,).
-    at : 3D only: positions of the slices by axis, ``{"z": 0.5}``; the middle of every axis if not given.
-    levels : about how many contour levels.
-    colorbar : draw one, for 2D and 3D.
-    ax : axes; in 3D one for every slice.
+    sol : Solution
+        A ``js.Solution``.
+    field : int
+        The field of a system.
+    exact : function, optional
+        1D only: the exact solution to draw beside it, a function of one point x (1,).
+    at : mapping, optional
+        3D only: positions of the slices by axis, ``{"z": 0.5}``; the middle of every axis if not given.
+    levels : int
+        About how many contour levels.
+    colorbar : bool
+        Draw one, for 2D and 3D.
+    ax : Axes or array of Axes, optional
+        Axes; in 3D one for every slice.
+
+    Returns
+    -------
+    Axes or array of Axes
+        In 3D an array, one per slice.
 
     Raises
     ------
     ValueError
         For a field, a slice or a number of axes that does not fit.
-
-    Returns
-    -------
-    The axes; in 3D an array of them, one per slice.
 
     Examples
     --------
@@ -152,8 +171,30 @@ def _regions(cloud: Cloud) -> list[tuple[Cloud, dict[str, str]]]:
 
 def values(cloud: Cloud, numbers: Any, *, log: bool = False, label: str = "", at: Mapping[str, float] | None = None,
            levels: int = 20, colorbar: bool = True, ax: Any = None) -> Any:  # fmt: skip
-    """Any numbers (N,) at the particles as a map; ``log`` for a logarithmic scale. ``at``, ``levels``,
-    ``colorbar`` and ``ax`` as in :func:`solution`. Raises ValueError unless ``numbers`` are (N,) and finite.
+    """Any numbers at the particles as a map.
+
+    Parameters
+    ----------
+    cloud : Cloud
+        The particles.
+    numbers : array_like (N,)
+        One for each, finite.
+    log : bool
+        A logarithmic scale.
+    label : str
+        What the numbers are.
+    at, levels, colorbar, ax : optional
+        As in ``js.plot.solution``.
+
+    Returns
+    -------
+    Axes or array of Axes
+        In 3D an array, one per slice.
+
+    Raises
+    ------
+    ValueError
+        Unless ``numbers`` are (N,) and finite.
 
     Examples
     --------
@@ -182,10 +223,28 @@ def values(cloud: Cloud, numbers: Any, *, log: bool = False, label: str = "", at
 
 
 def error(sol: Solution, exact: Any, *, field: int = 0, log: bool = True, ax: Any = None, **options: Any) -> Any:
-    """The error |u - exact| at the particles; ``exact`` is an array (N,) or a function of one point x (D,).
+    """The error |u - exact| at the particles.
 
-    ``sol`` and ``field`` as in :func:`solution`, ``log`` and ``options`` go to :func:`values`. Raises ValueError for
-    an exact solution of another size.
+    Parameters
+    ----------
+    sol : Solution
+        Whose error.
+    exact : array_like (N,) or function
+        The exact values, or a function of one point x (D,).
+    field : int
+        The field of a system.
+    log, ax, **options : optional
+        As in ``js.plot.values``.
+
+    Returns
+    -------
+    Axes or array of Axes
+        In 3D an array, one per slice.
+
+    Raises
+    ------
+    ValueError
+        For an exact solution of another size.
 
     Examples
     --------
@@ -205,9 +264,21 @@ def error(sol: Solution, exact: Any, *, field: int = 0, log: bool = True, ax: An
 
 
 def estimate(sol: Solution, *, field: int = 0, log: bool = True, ax: Any = None, **options: Any) -> Any:
-    """The estimated error of a solution at the particles, :meth:`jsmitsm.Solution.error_estimate`, as a map.
+    """The estimated error at the particles, ``js.Solution.error_estimate``, as a map.
 
-    ``sol`` and ``field`` as in :func:`solution`, ``log``, ``ax`` and ``options`` go to :func:`values`.
+    Parameters
+    ----------
+    sol : Solution
+        Whose error.
+    field : int
+        The field of a system.
+    log, ax, **options : optional
+        As in ``js.plot.values``.
+
+    Returns
+    -------
+    Axes or array of Axes
+        In 3D an array, one per slice.
 
     Examples
     --------
@@ -224,7 +295,17 @@ def estimate(sol: Solution, *, field: int = 0, log: bool = True, ax: Any = None,
 def sparsity(what: Any, *, ax: Any = None) -> Any:
     """Which particles each particle looks at, as a matrix: row i has a dot for every neighbour of particle i.
 
-    ``what``: :class:`jsmitsm.Stencils`, a :class:`jsmitsm.Solution`, or a matrix (scipy.sparse or an array).
+    Parameters
+    ----------
+    what : Stencils, Solution, matrix or array
+        A matrix of scipy.sparse will do.
+    ax : Axes, optional
+        Where to draw.
+
+    Returns
+    -------
+    Axes
+        What it was drawn on.
 
     Examples
     --------
@@ -256,10 +337,25 @@ def sparsity(what: Any, *, ax: Any = None) -> Any:
 def tuning(result: Any, *, ax: Any = None) -> Any:
     """The history of a tuning: the objective and every parameter over the steps.
 
-    ``result``: what :func:`jsmitsm.tune` returned, or its ``history``: a mapping from ``"objective"`` and the
-    parameters' names to one entry per step, or a pytree of such. A parameter with one number per particle is
-    drawn as its median and its range. ``ax``: as many axes as there are panels. Returns an array of them. Raises
-    ValueError for a history without ``"objective"``.
+    A parameter with one number per particle is drawn as its median and its range.
+
+    Parameters
+    ----------
+    result : TuneResult or mapping
+        What ``js.tune`` returned, or its ``history``: from ``"objective"`` and the parameters' names to one entry
+        per step, or a pytree of such.
+    ax : array of Axes, optional
+        As many as there are panels.
+
+    Returns
+    -------
+    array of Axes
+        One per panel.
+
+    Raises
+    ------
+    ValueError
+        For a history without ``"objective"``.
 
     Examples
     --------
@@ -302,11 +398,22 @@ def convergence(spacing: Any, errors: Any, *, floor: float = 1e-13, xlabel: str 
 
     Parameters
     ----------
-    spacing : (M,) distances between particles, in any order.
-    errors : (M,) errors, or a mapping from a name to them for several lines.
-    floor : errors below it are round-off and take no part in the order, which is the slope of the
-        least-squares line through the others.
-    xlabel, ylabel : names of the axes.
+    spacing : array_like (M,)
+        (M,) distances between particles, in any order.
+    errors : array_like (M,) or mapping
+        (M,) errors, or a mapping from a name to them for several lines.
+    floor : float
+        Errors below it are round-off and take no part in the order, which is the slope of the least-squares line
+        through the others.
+    xlabel, ylabel : str
+        Names of the axes.
+    ax : Axes, optional
+        Where to draw.
+
+    Returns
+    -------
+    Axes
+        What it was drawn on.
 
     Raises
     ------

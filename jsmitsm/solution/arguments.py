@@ -30,7 +30,7 @@ DEEPEST = 4
 
 
 class SolveOptions(TypedDict, total=False):
-    """Options of :func:`jsmitsm.solve` that others pass on to it."""
+    """Options of ``js.solve`` that others pass on to it."""
 
     method: Method
     order: int
@@ -71,7 +71,7 @@ def check(
     problem, cloud, method, order, kernel, stencils, formulation="auto", solver="auto", u0=None, throw=True,
     depth="auto",
 ) -> None:
-    """Arguments of :func:`solve` that can be judged before any work."""
+    """Arguments of ``js.solve`` that can be judged before any work."""
     for value, kind, name in ((problem, Problem, "problem"), (cloud, Cloud, "cloud")):
         if not isinstance(value, kind):
             raise ValueError(f"{name}: expected a js.{kind.__name__}, got {type(value).__name__}")

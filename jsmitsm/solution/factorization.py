@@ -26,10 +26,18 @@ from jsmitsm.solution.solution import Solution
 
 
 class Factorization:
-    """A problem ready to be solved again; made by :func:`factorize`, which has an example.
+    """A problem ready to be solved again; made by ``js.factorize``.
 
-    ``solve(problem)`` keeps the neighbours, the rows and the factors as long as only the source and
-    the values in the conditions changed, and makes anew what else did.
+    It keeps the neighbours, the rows and the factors as long as only the source and the values in the
+    conditions changed, and makes anew what else did.
+
+    Examples
+    --------
+    >>> import jax; jax.config.update("jax_enable_x64", True)
+    >>> import jsmitsm as js
+    >>> ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(0.0)}
+    >>> js.factorize(js.Problem(lambda u, x: js.laplacian(u)(x) + 1.0, ends), js.interval(0.0, 1.0, 11))
+    Factorization(9 unknowns, method='S')
     """
 
     def __init__(self, disc: Discretization, problem: Problem, solver: str, repair: bool, formulation: str):
@@ -46,7 +54,32 @@ class Factorization:
     def solve(self, problem: Problem) -> Solution:
         """The solution of a problem with the same operator; source and boundary values may differ.
 
-        Raises ValueError for another kind of operator or conditions, SolveError as :func:`jsmitsm.solve` does.
+        Parameters
+        ----------
+        problem : Problem
+            What is solved.
+
+        Returns
+        -------
+        Solution
+            As ``js.solve`` gives it.
+
+        Raises
+        ------
+        ValueError
+            For another kind of operator or conditions.
+        SolveError
+            As ``js.solve`` does.
+
+        Examples
+        --------
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import jsmitsm as js
+        >>> ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(0.0)}
+        >>> heated = lambda q: js.Problem(lambda u, x: js.laplacian(u)(x) + q, ends)
+        >>> ready = js.factorize(heated(1.0), js.interval(0.0, 1.0, 11))
+        >>> round(float(ready.solve(heated(8.0)).u[5]), 10)
+        1.0
         """
         old = self._disc
         method, order, kernel = old.scheme.method, old.rec.order, old.kernel
@@ -115,12 +148,27 @@ def factorize(
 ) -> Factorization:  # fmt: skip
     """Prepare a linear problem for many right-hand sides.
 
-    Returns an object whose ``solve(problem)`` reuses everything that a change of the source or of
-    the values in the conditions leaves valid: neighbours, moment systems, ordering and factors.
+    What a change of the source or of the values in the conditions leaves valid is kept: neighbours, moment
+    systems, ordering and factors.
 
-    ``method``, ``order``, ``kernel``, ``stencils``, ``basis_terms``, ``formulation``, ``solver`` and ``depth`` as for
-    :func:`jsmitsm.solve`.
-    Raises ValueError for a nonlinear problem: its matrix changes in every step.
+    Parameters
+    ----------
+    problem : Problem
+        A linear one.
+    cloud : Cloud
+        Where it is solved.
+    method, order, kernel, stencils, basis_terms, formulation, solver, depth : optional
+        As for ``js.solve``.
+
+    Returns
+    -------
+    Factorization
+        Its ``solve(problem)`` gives a solution.
+
+    Raises
+    ------
+    ValueError
+        For a nonlinear problem: its matrix changes in every step.
 
     Examples
     --------

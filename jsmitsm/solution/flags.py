@@ -2,7 +2,7 @@
 
 None of the tests costs a moment system: some solves with the kept factors and sums over neighbours.
 They clear what is linear, of one field and far from their bounds. Everywhere else the error estimate
-(:meth:`Solution.error_estimate`) is asked, which costs another assembly of a higher order, and decides: it clears
+(``js.Solution.error_estimate``) is asked, which costs another assembly of a higher order, and decides: it clears
 what was only suspected, and is a flag itself where it is large. A healthy solution has no flags. A flag is no proof of
 an error, nor its absence one of accuracy.
 """

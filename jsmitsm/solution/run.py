@@ -185,7 +185,7 @@ class Run:
     def assembled(self, nums: Numbers, parts: list[Any] | None = None) -> tuple[Any, Any, Any, Any]:
         """The global system: entries of the matrix, their rows and columns, and the right-hand side.
 
-        parts: see :func:`jsmitsm.discretization.least_squares.least_squares`.
+        parts: see ``jsmitsm.discretization.least_squares.least_squares``.
         """
         clock, disc = time.perf_counter, self.disc
         start = clock()
@@ -345,7 +345,7 @@ class Run:
         return health.condition_numbers(self.disc, self.nums), float(whole)
 
     def flags(self, estimated: Callable[[], float]) -> list[str]:
-        """What speaks against the solution, in sentences; see :mod:`jsmitsm.solution.flags`."""
+        """What speaks against the solution, in sentences; see ``jsmitsm.solution.flags``."""
         if self.values is None or self.nums is None:
             return list(self.against)
         return flags(self, self.values, self.nums, estimated)[0] + self.against

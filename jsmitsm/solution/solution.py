@@ -35,16 +35,24 @@ class Report(Protocol):
 class Solution:
     """A solution at the particles, and anywhere through local Taylor polynomials.
 
-    Attributes
-    ----------
-    u : (N,) values at the particles in the cloud's order, (N, F) for a system.
-    coefficients : (N, K) unscaled Taylor coefficients d^a u / a! at every particle, in the order
-        of :func:`jsmitsm.multi_indices`; (N, K, F) for a system. Fitted when first asked for.
-    converged : whether the solve met its tolerance; iterations : Newton steps (1 if linear).
-    stats : seconds per phase, sizes, what was skipped or repaired.
 
     ``sol(points)`` evaluates it at points (M, D), ``sol.grad(points)`` its gradient.
+
     A solution is a pytree: it passes through ``jax.jit``, ``jax.grad`` and ``pickle``.
+
+    Attributes
+    ----------
+    u : array (N,) or (N, F)
+        (N,) values at the particles in the cloud's order, (N, F) for a system.
+    coefficients : array (N, K) or (N, K, F)
+        (N, K) unscaled Taylor coefficients d^a u / a! at every particle, in the order of
+        ``js.multi_indices``; (N, K, F) for a system. Fitted when first asked for.
+    converged : bool
+        Whether the solve met its tolerance.
+    iterations : int
+        Newton steps (1 if linear).
+    stats : dict
+        Seconds per phase, sizes, what was skipped or repaired.
 
     Examples
     --------
@@ -113,7 +121,7 @@ class Solution:
 
     @property
     def coefficients(self) -> Array:
-        """Taylor coefficients d^a u / a!, (N, K), ordered as :func:`jsmitsm.multi_indices`; (N, K, F) for a system."""
+        """Taylor coefficients d^a u / a!, (N, K), ordered as ``js.multi_indices``; (N, K, F) for a system."""
         fitted = self._taylor
         return fitted[:, 0] if self._recipe.fields == 1 else jnp.swapaxes(fitted, 1, 2)
 
@@ -129,24 +137,76 @@ class Solution:
         return self._fitted
 
     def __call__(self, points: ArrayLike, *, blend: bool = False, outside: str = "nan") -> jax.Array:
-        """Values (M,) at ``points`` (M, D), (M, F) for a system.
+        """Values anywhere, from the local Taylor polynomials.
 
         Each point takes the polynomial of its nearest particle, or with ``blend`` a smooth average
         of those of its nearest few, which is continuous across the cloud.
 
-        outside : what becomes of points outside of the domain and in its holes: "nan", "raise" (ValueError), or
-            "extrapolate", with the polynomial of the particle nearest to them. Points up to half the local spacing
-            outside count as inside. The particles tell what is inside (:mod:`jsmitsm.cloud.inside`); where all of a
-            cloud's points are traced by jax.jit or jax.vmap nothing is known of them, and everything counts as inside.
+        Parameters
+        ----------
+        points : array_like (M, D)
+            Where.
+        blend : bool
+            Average the polynomials of the nearest few particles.
+        outside : {"nan", "raise", "extrapolate"}
+            What becomes of points outside of the domain and in its holes: NaN, a ValueError, or the polynomial of
+            the particle nearest to them. Points up to half the local spacing outside count as inside. The particles
+            tell what is inside; where all of a cloud's points are traced by jax.jit or jax.vmap nothing is known of
+            them, and everything counts as inside.
 
-        Raises ValueError for points of another shape, NaN or infinite ones.
+        Returns
+        -------
+        jax.Array
+            (M,), for a system (M, F).
+
+        Raises
+        ------
+        ValueError
+            For points of another shape, NaN or infinite ones.
+
+        Examples
+        --------
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import jsmitsm as js
+        >>> ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(1.0)}
+        >>> problem = js.Problem(lambda u, x: js.laplacian(u)(x) - 6 * x[0], ends)  # x^3
+        >>> sol = js.solve(problem, js.interval(0.0, 1.0, 9))
+        >>> round(float(sol([[0.5]])[0]), 9)
+        0.125
         """
         return self.derivative(points, (0,) * self.cloud.dim, blend=blend, outside=outside)
 
     def grad(self, points: ArrayLike, *, blend: bool = False, outside: str = "nan") -> jax.Array:
-        """Gradients (M, D) at ``points`` (M, D), (M, F, D) for a system; ``blend`` and ``outside`` as for values.
+        """Gradients anywhere.
 
-        Raises ValueError for points of another shape, NaN or infinite ones.
+        Parameters
+        ----------
+        points : array_like (M, D)
+            Where.
+        blend : bool
+            Average the polynomials of the nearest few particles, as for values.
+        outside : {"nan", "raise", "extrapolate"}
+            What becomes of points outside of the domain, as for values.
+
+        Returns
+        -------
+        jax.Array
+            (M, D), for a system (M, F, D).
+
+        Raises
+        ------
+        ValueError
+            For points of another shape, NaN or infinite ones.
+
+        Examples
+        --------
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import jsmitsm as js
+        >>> ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(1.0)}
+        >>> problem = js.Problem(lambda u, x: js.laplacian(u)(x) - 6 * x[0], ends)  # x^3
+        >>> sol = js.solve(problem, js.interval(0.0, 1.0, 9))
+        >>> round(float(sol.grad([[0.5]])[0, 0]), 9)
+        0.75
         """
         unit = [tuple(map(int, b)) for b in np.eye(self.cloud.dim, dtype=int)]
         return jnp.stack([self.derivative(points, b, blend=blend, outside=outside) for b in unit], axis=-1)
@@ -154,10 +214,38 @@ class Solution:
     def derivative(
         self, points: ArrayLike, multi_index: Sequence[int], *, blend: bool = False, outside: str = "nan"
     ) -> jax.Array:
-        """The derivative d^b u at ``points`` (M, D), b = ``multi_index``, |b| at most the order: (M,) or (M, F).
+        """Any derivative d^b u anywhere.
 
-        With ``blend`` the polynomials' derivatives are averaged; ``outside`` as for values. Raises ValueError for
-        wrong points or orders.
+        Parameters
+        ----------
+        points : array_like (M, D)
+            Where.
+        multi_index : sequence of int (D,)
+            b, the order along each axis, together at most the order.
+        blend : bool
+            Average the polynomials' derivatives, as for values.
+        outside : {"nan", "raise", "extrapolate"}
+            What becomes of points outside of the domain, as for values.
+
+        Returns
+        -------
+        jax.Array
+            (M,), for a system (M, F).
+
+        Raises
+        ------
+        ValueError
+            For wrong points or orders.
+
+        Examples
+        --------
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import jsmitsm as js
+        >>> ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(1.0)}
+        >>> problem = js.Problem(lambda u, x: js.laplacian(u)(x) - 6 * x[0], ends)  # x^3
+        >>> sol = js.solve(problem, js.interval(0.0, 1.0, 9))
+        >>> round(float(sol.derivative([[0.5]], (2,))[0]), 9)
+        3.0
         """
         self.refuse_stacked()
         points = checked_points(points, self.cloud.dim)
@@ -175,11 +263,27 @@ class Solution:
         return values[:, 0] if self._recipe.fields == 1 else values
 
     def integral(self, group: str | None = None) -> jax.Array:
-        """The integral of u over a boundary group, or without a name over the domain: a scalar or (F,).
+        """The integral of u over a boundary group, or without a name over the domain.
 
-        That over the domain has the order of the solution, on curved domains too; see :func:`jsmitsm.quadrature`.
-        Raises ValueError for a group that is no boundary group.
+        That over the domain has the order of the solution, on curved domains too; see ``js.quadrature``.
 
+        Parameters
+        ----------
+        group : str, optional
+            The name of a boundary group.
+
+        Returns
+        -------
+        jax.Array
+            A scalar, for a system (F,); units of u times length, area or volume.
+
+        Raises
+        ------
+        ValueError
+            For a group that is no boundary group.
+
+        Examples
+        --------
         >>> import jax; jax.config.update("jax_enable_x64", True)
         >>> import jsmitsm as js
         >>> ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(1.0)}
@@ -192,11 +296,34 @@ class Solution:
         return jnp.tensordot(weights, self(points, outside="extrapolate"), axes=1)
 
     def flux(self, group: str, conductivity: ValueOrFunction = 1.0) -> jax.Array:
-        """The integral of conductivity n . grad u over a boundary group, n outward: a scalar or (F,).
+        """The integral of conductivity n . grad u over a boundary group, n outward.
 
-        conductivity : a number, or a function of one point x (D,).
+        Parameters
+        ----------
+        group : str
+            The name of a boundary group.
+        conductivity : float or function
+            A number, or a function of one point x (D,).
 
-        Raises ValueError for a group that is no boundary group.
+        Returns
+        -------
+        jax.Array
+            A scalar, for a system (F,).
+
+        Raises
+        ------
+        ValueError
+            For a group that is no boundary group.
+
+        Examples
+        --------
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import jsmitsm as js
+        >>> ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(1.0)}
+        >>> problem = js.Problem(lambda u, x: js.laplacian(u)(x) - 6 * x[0], ends)  # x^3
+        >>> sol = js.solve(problem, js.interval(0.0, 1.0, 9))
+        >>> round(float(sol.flux("right", conductivity=2.0)), 9)
+        6.0
         """
         self.refuse_stacked()
         points, weights, normals = quadrature(self.cloud, group)
@@ -208,10 +335,29 @@ class Solution:
         return jnp.tensordot(weights * conductivity, slope, axes=1)
 
     def error_estimate(self) -> Array:
-        """Estimated error |u - u_exact| at every particle, (N,) or (N, F), by defect correction.
+        """Estimated error |u - u_exact| at every particle, by defect correction.
 
         Computed when asked for: one more assembly at order p + 2 and one solve with the kept factors.
-        Raises ValueError for a solution that was pickled, and where the points are traced.
+
+        Returns
+        -------
+        array (N,) or (N, F)
+            In units of u.
+
+        Raises
+        ------
+        ValueError
+            For a solution that was pickled, and where the points are traced.
+
+        Examples
+        --------
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import jsmitsm as js
+        >>> ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(1.0)}
+        >>> problem = js.Problem(lambda u, x: js.laplacian(u)(x) - 6 * x[0], ends)  # x^3
+        >>> sol = js.solve(problem, js.interval(0.0, 1.0, 9))
+        >>> bool(sol.error_estimate().max() < 1e-10)
+        True
         """
         self.refuse_stacked()
         if self._error is not None:
@@ -237,7 +383,28 @@ class Solution:
         return not hasattr(self._fit, "error_estimate")
 
     def correction(self) -> Correction:
-        """What the error estimate is made of, for those who refine by it: signed errors, defects and their weights."""
+        """What the error estimate is made of, for those who refine by it.
+
+        Returns
+        -------
+        Correction
+            Signed errors, defects and their weights.
+
+        Raises
+        ------
+        ValueError
+            For a solution in several regions, which has no defects to refine by.
+
+        Examples
+        --------
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import jsmitsm as js
+        >>> ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(1.0)}
+        >>> problem = js.Problem(lambda u, x: js.laplacian(u)(x) - 6 * x[0], ends)  # x^3
+        >>> sol = js.solve(problem, js.interval(0.0, 1.0, 9))
+        >>> bool(abs(sol.correction().error).max() < 1e-10)
+        True
+        """
         self.refuse_stacked()
         if not self.defects:
             raise ValueError("correction: several regions have an error estimate, but no defects to refine by")
@@ -270,13 +437,30 @@ class Solution:
         return [*(self._found or []), *self.stats.get("objections", []), *([] if self._share <= LARGE else [large])]
 
     def condition_numbers(self) -> tuple[np.ndarray, float]:
-        """The condition number (N,) of every particle's moment matrix, and an estimate of the global system's.
+        """Condition numbers of every particle's moment matrix and of the global system.
 
         The matrices are those with rows and columns scaled to about one, so that units do not count.
-        NaN for particles whose values are held. They say how many digits round-off may take; they do not
-        predict the error: the Lebesgue constants do more.
+        They say how many digits round-off may take; they do not predict the error: the Lebesgue constants do more.
 
-        Raises ValueError for a solution that was pickled or made under ``jax.jit``.
+        Returns
+        -------
+        tuple of (array (N,), float)
+            Every particle's, NaN where the value is held; and an estimate of the global system's.
+
+        Raises
+        ------
+        ValueError
+            For a solution that was pickled or made under ``jax.jit``.
+
+        Examples
+        --------
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import jsmitsm as js
+        >>> ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(1.0)}
+        >>> problem = js.Problem(lambda u, x: js.laplacian(u)(x) - 6 * x[0], ends)  # x^3
+        >>> sol = js.solve(problem, js.interval(0.0, 1.0, 9))
+        >>> sol.condition_numbers()[0].shape
+        (9,)
         """
         if self._report is None:
             raise ValueError(
@@ -286,7 +470,23 @@ class Solution:
         return self._report.condition_numbers()
 
     def diagnose(self) -> str:
-        """In words: how the solve went, which particles were weak and what was done."""
+        """In words: how the solve went, which particles were weak and what was done.
+
+        Returns
+        -------
+        str
+            Several lines; those that begin with FLAG speak against the solution.
+
+        Examples
+        --------
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import jsmitsm as js
+        >>> ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(1.0)}
+        >>> problem = js.Problem(lambda u, x: js.laplacian(u)(x) - 6 * x[0], ends)  # x^3
+        >>> sol = js.solve(problem, js.interval(0.0, 1.0, 9))
+        >>> "FLAG" in sol.diagnose()
+        False
+        """
         self.refuse_stacked()
         s = self.stats
         lines = [repr(self)]

@@ -45,26 +45,44 @@ def solve(
 
     Parameters
     ----------
-    method : "I", "II", "III" (SMITSM, Karamanli 2015), "SSPH", or "S", the recursion with
-        symmetric moment rows.
-    order : total degree of the fit. "auto": the lowest even one from 4 whose estimated error is within ``tol``; where
+    problem : Problem
+        What is solved.
+    cloud : Cloud
+        The particles it is solved on.
+    method : {"S", "I", "II", "III", "SSPH"}
+        "I", "II", "III" (SMITSM, Karamanli 2015), "SSPH", or "S", the recursion with symmetric moment rows.
+    order : int or "auto"
+        Total degree of the fit. "auto": the lowest even one from 4 whose estimated error is within ``tol``; where
         none is, the best one, with a flag that says so.
-    tol : with ``order="auto"``, the wanted error relative to the largest \\|u\\|. The cloud stays as it is:
-        :func:`jsmitsm.adapt` makes one that the tolerance needs.
-    depth : degrees by which the recursion goes beyond the order: the local polynomials have degree
-        order + depth, with no more free coefficients. 0 is the paper's. "auto" is, for method S, 4 in 1D and 2D (2 at
-        order 2), in 3D 2, or 4 where the operator is constant and of one order; for I, II and III 0. SSPH has no
-        recursion to go deeper with.
-    kernel : weights and supports; chosen from the cloud, the order and the method if not given.
-    stencils : from :func:`jsmitsm.stencils`; needed where JAX traces ``h``, ``d`` or the points.
-    basis_terms : keep only the first so many free coefficients (I, II, III).
-    formulation : "loo" (each value is predicted by its neighbours), "lsq" (least squares over
-        all local fits) or "auto".
-    solver : "auto", "dense" (pure JAX), "sparse" (direct), "mixed" (direct, its factors in float32
-        and the rest in float64: two thirds of the time and memory) or "iterative".
-    u0 : start of Newton's method for a nonlinear problem: (N,), (N, F) or a function of x.
-    throw : raise :class:`jsmitsm.SolveError` where the solve fails; otherwise, and always under
-        jit, ``converged`` is False.
+    tol : float, optional
+        With ``order="auto"``, the wanted error relative to the largest |u|. The cloud stays as it is:
+        ``js.adapt`` makes one that the tolerance needs.
+    depth : int or "auto"
+        Degrees by which the recursion goes beyond the order: the local polynomials have degree order + depth, with
+        no more free coefficients. 0 is the paper's. "auto" is, for method S, 4 in 1D and 2D (2 at order 2), in 3D
+        2, or 4 where the operator is constant and of one order; for I, II and III 0. SSPH has no recursion to go
+        deeper with.
+    kernel : Kernel, optional
+        Weights and supports; chosen from the cloud, the order and the method if not given.
+    stencils : Stencils, optional
+        From ``js.stencils``; needed where JAX traces ``h``, ``d`` or the points.
+    basis_terms : int, optional
+        Keep only the first so many free coefficients (I, II, III).
+    formulation : {"auto", "loo", "lsq"}
+        "loo" (each value is predicted by its neighbours), "lsq" (least squares over all local fits) or "auto".
+    solver : {"auto", "dense", "sparse", "mixed", "iterative"}
+        "auto", "dense" (pure JAX), "sparse" (direct), "mixed" (direct, its factors in float32 and the rest in
+        float64: two thirds of the time and memory) or "iterative".
+    u0 : array_like or function, optional
+        Start of Newton's method for a nonlinear problem: (N,), (N, F) or a function of x.
+    throw : bool
+        Raise ``js.SolveError`` where the solve fails; otherwise, and always under jit, ``converged`` is
+        False.
+
+    Returns
+    -------
+    Solution
+        Values, derivatives, integrals, error estimate.
 
     Raises
     ------
@@ -111,7 +129,7 @@ def prepared(
     stencils: Stencils | None = None, basis_terms: int | None = None, formulation: str = "auto", solver: str = "auto",
     u0: Any = None, throw: bool = True, depth: Depth = "auto",
 ) -> Run:  # fmt: skip
-    """Checked arguments of :func:`solve`, discretised."""
+    """Checked arguments of ``js.solve``, discretised."""
     start = time.perf_counter()
     check(problem, cloud, method, order, kernel, stencils, formulation, solver, u0, throw, depth)
     disc = discretize(problem, cloud, method, order, kernel, stencils, basis_terms, sources=False, depth=depth)

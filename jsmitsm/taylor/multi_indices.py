@@ -19,11 +19,29 @@ HIGHEST = 14
 
 @cache
 def multi_indices(dim: int, degree: int) -> tuple[MultiIndex, ...]:
-    """All multi-indices of ``dim`` axes up to total ``degree``, graded.
+    """All multi-indices up to a total degree, graded.
 
     Inside a degree they descend in the first axis, so every lower degree is a prefix.
-    A negative degree gives none.  Raises ``ValueError`` if ``dim`` is below 1.
 
+    Parameters
+    ----------
+    dim : int
+        Number of axes D.
+    degree : int
+        The largest total degree; a negative one gives none.
+
+    Returns
+    -------
+    tuple of tuple of int
+        (D,) each, in the order of ``Solution.coefficients``.
+
+    Raises
+    ------
+    ValueError
+        If ``dim`` is below 1 or ``degree`` no whole number.
+
+    Examples
+    --------
     >>> multi_indices(2, 2)
     ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
     """

@@ -36,7 +36,7 @@ class Point(NamedTuple):
 
 
 class Descent:
-    """A search from the start of ``space``; :meth:`run` leaves ``points``, ``best`` and ``messages``."""
+    """A search from the start of ``space``; ``run`` leaves ``points``, ``best`` and ``messages``."""
 
     def __init__(self, space: ParameterMap, objective: Objective, optimizer: Any, steps: int):
         self.space, self.objective, self.steps = space, objective, steps

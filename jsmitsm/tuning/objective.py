@@ -70,7 +70,7 @@ class Objective:
     """A problem, a function to be made small, and the stencil pattern on which kernels are compared.
 
     target : "estimate" or a function Solution -> scalar.
-    options : of :func:`jsmitsm.solve`, method and order among them.
+    options : of ``js.solve``, method and order among them.
     """
 
     def __init__(self, problem: Problem, cloud: Cloud, kernel: Kernel, target: Any, options: dict[str, Any]):

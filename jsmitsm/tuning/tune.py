@@ -31,7 +31,7 @@ from jsmitsm.tuning.parameter_maps import ParameterMap
 
 
 class TuneOptions(SolveOptions, total=False):
-    """Options of :func:`jsmitsm.solve` for every solve of the search."""
+    """Options of ``js.solve`` for every solve of the search."""
 
     u0: ValueOrFunction | None
 
@@ -42,18 +42,33 @@ Parameter: TypeAlias = Literal["h", "d", "params"]
 
 @dataclass
 class TuneResult:
-    """What :func:`tune` found.
+    """What ``js.tune`` found.
 
     Attributes
     ----------
-    kernel : the best kernel met, never worse than the one it started from.
-    solution : the solution with it.
-    history : per evaluated step, ready to plot: ``"objective"`` (for "estimate" the relative
-        distance to the reference solution), ``"lebesgue"`` (the largest Lebesgue constant), and
-        each tuned parameter under its name, (steps,) or (steps, N); ``"params"`` has the form of
-        the kernel's own, every leaf with a leading axis of steps.
-    messages : in words, where tuning had to step back, widen a support or stop.
-    solves : number of solves, those of the reference and of the returned solution included.
+    kernel : Kernel
+        The best kernel met, never worse than the one it started from.
+    solution : Solution
+        The solution with it.
+    history : dict
+        Per evaluated step, ready to plot: ``"objective"`` (for "estimate" the relative distance to the reference
+        solution), ``"lebesgue"`` (the largest Lebesgue constant), and each tuned parameter under its name, (steps,)
+        or (steps, N); ``"params"`` has the form of the kernel's own, every leaf with a leading axis of steps.
+    messages : list of str
+        In words, where tuning had to step back, widen a support or stop.
+    solves : int
+        Number of solves, those of the reference and of the returned solution included.
+
+    Examples
+    --------
+    >>> import jax; jax.config.update("jax_enable_x64", True)
+    >>> import jsmitsm as js
+    >>> ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(0.0)}
+    >>> problem = js.Problem(lambda u, x: js.laplacian(u)(x) + x[0], ends)
+    >>> start = js.SuperGaussian(h=0.125, d=4.0)
+    >>> found = js.tune(problem, js.interval(0.0, 1.0, 17), start, order=3, steps=2)
+    >>> isinstance(found, js.TuneResult), sorted(found.history)
+    (True, ['d', 'h', 'lebesgue', 'objective'])
     """
 
     kernel: Kernel
@@ -89,19 +104,36 @@ def tune(
 
     Parameters
     ----------
-    kernel : where to start. ``h`` scalar, or (N,) to tune one smoothing length per particle. If not given, what
-        :func:`jsmitsm.solve` takes, its smoothing lengths by one factor unless ``groups`` says otherwise.
-    objective : "estimate", the distance to a reference solution of higher order that is computed
-        once; or a function of a :class:`jsmitsm.Solution` that returns a scalar to be made small.
-        Both are held by a bound on the Lebesgue constant: 1.5, or that of h = spacing, d = 4.
-    parameters : some of "h", "d" and, for a kernel that has them, "params". Every floating-point
-        leaf of ``params`` is tuned, its sign kept where it starts positive.
-    optimizer : any optax transformation; Adam with a decaying step if not given.
-    steps : at most so many steps; fewer where nothing is gained any more.
-    progress : show a bar, where tqdm is installed and stderr is a terminal.
-    groups : (N,) whole numbers; particles with the same one share a factor on ``h``, so that a
-        graded ``h`` keeps its grading.
-    solve_options : ``method``, ``order`` and the others of :func:`jsmitsm.solve`.
+    problem : Problem
+        What is solved.
+    cloud : Cloud
+        The particles it is solved on.
+    kernel : Kernel, optional
+        Where to start. ``h`` scalar, or (N,) to tune one smoothing length per particle. If not given, what
+        ``js.solve`` takes, its smoothing lengths by one factor unless ``groups`` says otherwise.
+    objective : "estimate" or function
+        "estimate", the distance to a reference solution of higher order that is computed once; or a function of a
+        ``js.Solution`` that returns a scalar to be made small. Both are held by a bound on the Lebesgue
+        constant: 1.5, or that of h = spacing, d = 4.
+    parameters : str or sequence of str
+        Some of "h", "d" and, for a kernel that has them, "params". Every floating-point leaf of ``params`` is
+        tuned, its sign kept where it starts positive.
+    optimizer : optax transformation, optional
+        Any optax transformation; Adam with a decaying step if not given.
+    steps : int
+        At most so many steps; fewer where nothing is gained any more.
+    progress : bool
+        Show a bar, where tqdm is installed and stderr is a terminal.
+    groups : array_like (N,), optional
+        (N,) whole numbers; particles with the same one share a factor on ``h``, so that a graded ``h`` keeps its
+        grading.
+    solve_options : optional
+        ``method``, ``order`` and the others of ``js.solve``.
+
+    Returns
+    -------
+    TuneResult
+        The best kernel, its solution and the history.
 
     Raises
     ------
@@ -146,7 +178,7 @@ def tune(
 
 
 def _chosen(problem: Problem, cloud: Cloud, options: dict[str, Any]) -> Kernel:
-    """The kernel that :func:`jsmitsm.solve` takes where none is given."""
+    """The kernel that ``js.solve`` takes where none is given."""
     disc = discretized(problem, cloud, options["method"], options["order"], None, options.get("stencils"))
     return default_kernel(disc.points, np.arange(len(cloud)), disc.stencils.indices)
 

@@ -160,3 +160,25 @@ def test_neighbours_quadrature_and_quality_respect_the_regions(inclusion):
     assert abs(rule.weights.sum() / np.pi - 1) < 1e-3  # cubic arcs of a circle at 20 particles
     assert (np.einsum("qd,qd->q", rule.normals, rule.points - [0.1, 0]) > 0).all()
     assert js.quality(inclusion).mesh_ratio < 3
+
+
+def test_a_mesh_with_tagged_cells_is_a_cloud_of_regions():
+    meshio = pytest.importorskip("meshio")
+    n = 5
+    x, y = np.meshgrid(np.linspace(0, 1, n), np.linspace(0, 1, n), indexing="ij")
+    at = np.arange(n * n).reshape(n, n)
+    a, b, c, d = at[:-1, :-1].ravel(), at[1:, :-1].ravel(), at[1:, 1:].ravel(), at[:-1, 1:].ravel()
+    left, low = x[:-1, :-1].ravel() < 0.5, y[:-1, :-1].ravel() < 0.5
+    tag = np.where(left, 1, np.where(low, 2, 3))
+    names = {"steel": np.array([1, 2]), "air": np.array([2, 2]), "wool": np.array([3, 2])}
+    mesh = meshio.Mesh(
+        np.stack([x.ravel(), y.ravel()], axis=1), [("quad", np.stack([a, b, c, d], axis=1))],
+        cell_data={"gmsh:physical": [tag]}, field_data=names,
+    )  # fmt: skip
+    cloud = js.files.from_mesh(mesh, regions=True)
+    assert [len(ids) for ids in cloud.regions.values()] == [15, 9, 9]
+    assert list(cloud.interfaces) == ["steel|air", "steel|wool", "air|wool"]
+    assert np.abs(cloud.interface_normals["air|wool"] - [0, 1]).max() < 1e-12
+    assert list(js.files.from_mesh(mesh, regions=["wool", "steel", "air"]).interfaces)[0] == "wool|steel"
+    with pytest.raises(ValueError, match="quad cell|'quad' cell 0 belongs to no region"):
+        js.files.from_mesh(mesh, regions=["air", "wool"])

@@ -228,6 +228,8 @@ def test_conditions_are_never_guessed():
     refused(r"flux for \['a', 'c'\]", bcs={**ends, "a|b": js.interface({"a": flux["a"], "c": flux["b"]})})
     refused(r"does not depend on u", bcs={**ends, "a|b": js.interface({"a": flux["a"], "b": lambda u, x, n: 1.0})})
     refused(r"takes 2, two for each field", bcs={**ends, "a|b": js.interface(residual=lambda a, b, x, n: a(x) - b(x))})
+    turned = {"a": flux["a"], "b": lambda u, x, n: -2.0 * n @ js.grad(u)(x)}
+    refused(r"opposite signs.*same n, which points from 'a' to 'b'", bcs={**ends, "a|b": js.interface(turned)})
     refused(r"method: III is not made for clouds of several regions", method="III")
     refused(r"interfaces take equations of second order", pde={**both, "b": lambda u, x: js.partial(u, (4,))(x)})
     dot = js.sdf.circle((0.0, 0.0), 0.15)

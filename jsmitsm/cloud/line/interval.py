@@ -17,13 +17,27 @@ def interval(a: float, b: float, n: int | None = None, *, spacing: SpacingLike |
 
     Parameters
     ----------
-    n : so many, equally spaced.
-    spacing : instead of ``n``, the distance between neighbours in length units, a number or a function (M, 1) -> (M,)
-        of numpy arrays. It is met up to a common factor near 1: the ends are particles.
+    a, b : float
+        The ends, length units.
+    n : int, optional
+        So many, equally spaced.
+    spacing : float or function, optional
+        Instead of ``n``, the distance between neighbours in length units, a number or a function (M, 1) -> (M,) of
+        numpy arrays. It is met up to a common factor near 1: the ends are particles.
 
-    Raises ValueError unless b > a, for an ``n`` below 2, a ``spacing`` too coarse for a particle between the ends, or
-    both of them.
+    Returns
+    -------
+    Cloud
+        In 1D.
 
+    Raises
+    ------
+    ValueError
+        Unless b > a, for an ``n`` below 2, a ``spacing`` too coarse for a particle between the ends, or both of
+        them.
+
+    Examples
+    --------
     >>> import jsmitsm as js
     >>> js.interval(0.0, 1.0, 5).spacing
     0.25

@@ -159,7 +159,7 @@ def thin(
 ) -> np.ndarray:
     """Indices of a maximal subset with no two points closer than the smaller of their radii; low priority values first.
 
-    pairs: what :func:`near_pairs` finds for radii as large.
+    pairs: what ``near_pairs`` finds for radii as large.
     """
     if len(points) < 2:
         return np.arange(len(points))

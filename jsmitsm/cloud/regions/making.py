@@ -40,27 +40,35 @@ def regions(
 
     Parameters
     ----------
-    shapes : maps the name of each region to its shape: a signed distance as for :func:`jsmitsm.from_sdf`, a polygon
-        (V, 2), a shapely Polygon or MultiPolygon, or in 1D the ends (a, b) of a layer. Regions touch one another and
-        do not overlap: what surrounds an inclusion is ``js.sdf.difference(outer, inclusion)``.
-    bounds : (lo, hi), each (D,), a box that contains the domain; needed for signed distances.
-    spacing : distance between neighbours in length units, a number or a function (M, D) -> (M,) of numpy arrays.
-    seed : the same seed gives the same cloud.
-    groups : maps names of groups of the outer boundary to predicates as for :func:`jsmitsm.from_sdf`; without it the
+    shapes : mapping
+        Maps the name of each region to its shape: a signed distance as for ``js.from_sdf``, a polygon (V,
+        2), a shapely Polygon or MultiPolygon, or in 1D the ends (a, b) of a layer. Regions touch one another and do
+        not overlap: what surrounds an inclusion is ``js.sdf.difference(outer, inclusion)``.
+    bounds : pair of array_like (2,), optional
+        (lo, hi), each (D,), a box that contains the domain; needed for signed distances.
+    spacing : float or function
+        Distance between neighbours in length units, a number or a function (M, D) -> (M,) of numpy arrays.
+    seed : int
+        The same seed gives the same cloud.
+    groups : mapping, optional
+        Maps names of groups of the outer boundary to predicates as for ``js.from_sdf``; without it the
         outer boundary is the group ``"boundary"``.
 
     Returns
     -------
-    RegionCloud : the particles region by region. Where "a" and "b" touch there is the group ``"a|b"``, its name in the
-        order of ``shapes``, its normals from a to b. Ends of interfaces belong to the groups of the outer boundary.
+    RegionCloud
+        The particles region by region. Where "a" and "b" touch there is the group ``"a|b"``, its name in the order
+        of ``shapes``, its normals from a to b. Ends of interfaces belong to the groups of the outer boundary.
 
     Raises
     ------
     ValueError
         For shapes that overlap, leave a gap too thin for the spacing or are too small for it; for names that are no
-        strings or hold "|"; for bad bounds, spacing or groups, as :func:`jsmitsm.from_sdf`; and in 3D where an
+        strings or hold "|"; for bad bounds, spacing or groups, as ``js.from_sdf``; and in 3D where an
         interface ends on a curve: interfaces are closed surfaces there.
 
+    Examples
+    --------
     >>> import jsmitsm as js
     >>> disk = js.sdf.circle((0.0, 0.0), 0.5)
     >>> around = js.sdf.difference(js.sdf.rectangle((-1, -1), (1, 1)), disk)
@@ -286,6 +294,11 @@ def _check_gaps(sketch: _Sketch) -> None:
             joint = points[np.concatenate(ends)]
             gap = np.linalg.norm(points[near][:, None] - joint[None], axis=2).min(axis=1)
             near = near[gap > 2.0 * h[near]]
+        if len(near):
+            # A thin region between them is no gap.
+            height, way = shape.distance(points[near])
+            middle = points[near] - 0.5 * height[:, None] * way
+            near = near[np.min([other.distance(middle)[0] for other in sketch.shapes.values()], axis=0) > 0]
         if len(near):
             other = next(n for n, ids in sketch.on.items() if near[0] in ids)
             raise ValueError(

@@ -16,19 +16,27 @@ from jsmitsm.runtime.tracers import is_traced, owned
 
 @jax.tree_util.register_pytree_node_class
 class RegionCloud(Cloud):
-    """A cloud of several regions; made by :func:`jsmitsm.regions`.
+    """A cloud of several regions; made by ``js.regions``.
 
-    Attributes
-    ----------
-    points, groups, normals : as those of :class:`jsmitsm.Cloud`. Interfaces are groups too, ``"a|b"``, of the copies of
-        both sides; the normal of both is that from a to b.
-    regions : maps a name to the particles of that region, in ascending order; every particle belongs to one.
-    interfaces : maps ``"a|b"`` to the pairs (P, 2) of particles, first that in a. A particle where several interfaces
-        meet is in several pairs, and one at the end of an interface may belong to a group of the outer boundary.
-    interface_normals : maps ``"a|b"`` to the unit normals (P, D) of the pairs, from a to b.
 
     ``cloud.region("a")`` is the cloud of one region, with outward normals.
 
+    Attributes
+    ----------
+    points, groups, normals : array (N, D), mapping, array (N, D)
+        As those of ``js.Cloud``. Interfaces are groups too, ``"a|b"``, of the
+        copies of both sides; the normal of both is that from a to b.
+    regions : tuple of str
+        Mapping Maps a name to the particles of that region, in ascending order; every particle belongs to one.
+    interfaces : mapping
+        Maps ``"a|b"`` to the pairs (P, 2) of particles, first that in a. A particle where several
+        interfaces meet is in several pairs, and one at the end of an interface may belong to a group of the outer
+        boundary.
+    interface_normals : mapping
+        Maps ``"a|b"`` to the unit normals (P, D) of the pairs, from a to b.
+
+    Examples
+    --------
     >>> import jsmitsm as js
     >>> cloud = js.regions({"a": (0.0, 0.5), "b": (0.5, 1.0)}, spacing=0.125)
     >>> cloud.interfaces["a|b"], len(cloud.region("a"))
@@ -64,7 +72,29 @@ class RegionCloud(Cloud):
         return self._spacing
 
     def region(self, name: str) -> Cloud:
-        """The cloud of one region: its particles in their order, with outward normals. ValueError for other names."""
+        """The cloud of one region: its particles in their order, with outward normals.
+
+        Parameters
+        ----------
+        name : str
+            Of the region.
+
+        Returns
+        -------
+        Cloud
+            Its groups those of the boundary and the interfaces that it touches.
+
+        Raises
+        ------
+        ValueError
+            For other names.
+
+        Examples
+        --------
+        >>> import jsmitsm as js
+        >>> len(js.regions({"a": (0.0, 0.5), "b": (0.5, 1.0)}, spacing=0.125).region("a"))
+        5
+        """
         if name not in self.regions:
             known = list(self.regions)
             raise ValueError(f"region: {name!r} is none of the cloud's, {known}{did_you_mean(name, known)}")
@@ -83,7 +113,30 @@ class RegionCloud(Cloud):
         return new
 
     def replace(self, points: ArrayLike | None = None, normals: ArrayLike | None = None) -> Cloud:
-        """The same groups with other points or normals (traced values welcome); copies move together."""
+        """The same groups with other points or normals (traced values welcome); copies move together.
+
+        Parameters
+        ----------
+        points, normals : array_like (N, D), optional
+            What is replaced.
+
+        Returns
+        -------
+        RegionCloud
+            A new one; this one stays.
+
+        Raises
+        ------
+        ValueError
+            For another number of particles.
+
+        Examples
+        --------
+        >>> import jsmitsm as js
+        >>> layers = js.regions({"a": (0.0, 0.5), "b": (0.5, 1.0)}, spacing=0.125)
+        >>> layers.replace(points=2 * layers.points).spacing
+        0.25
+        """
         new = object.__new__(RegionCloud)
         if points is not None and np.shape(points) != self.points.shape:
             raise ValueError(

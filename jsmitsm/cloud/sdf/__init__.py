@@ -2,12 +2,14 @@
 
 Every function here returns a function ``x (D,) -> scalar``, negative inside, zero on the boundary,
 positive outside, written in ``jax.numpy``: it can be mapped, differentiated and handed to
-:func:`jsmitsm.from_sdf`. Centres, lengths and angles may be traced values. Gradients are finite
+``js.from_sdf``. Centres, lengths and angles may be traced values. Gradients are finite
 everywhere but where a docstring says otherwise, also where a plain norm would give NaN.
 
 The formulas are those of Quilez, "2D / 3D distance functions" (iquilezles.org/articles), rewritten
 so that the gradient is exact *on* the boundary, where particles are put.
 
+Examples
+--------
 >>> import jax.numpy as jnp, jsmitsm as js
 >>> plate = js.sdf.difference(js.sdf.rectangle((0, 0), (2, 1)), js.sdf.circle((1, 0.5), 0.25))
 >>> float(plate(jnp.array([1.0, 0.5])))
@@ -66,11 +68,27 @@ __all__ = [
 
 
 def ball(center: Any, radius: Any) -> Sdf:
-    """The ball |x - center| < radius in any dimension, also called :func:`sphere`; ``center`` (D,), lengths in length
-    units.
+    """The ball |x - center| < radius in any dimension, also called ``sphere``.
 
-    Raises ValueError for a radius that is not positive.
+    Parameters
+    ----------
+    center : array_like (D,)
+        Its centre, length units.
+    radius : float
+        Length units, positive.
 
+    Returns
+    -------
+    Sdf
+        The function x (D,) -> scalar.
+
+    Raises
+    ------
+    ValueError
+        For a radius that is not positive.
+
+    Examples
+    --------
     >>> import jax.numpy as jnp, jsmitsm as js
     >>> float(js.sdf.ball((0, 0, 0), 2.0)(jnp.array([0.0, 3.0, 4.0])))
     3.0
@@ -80,8 +98,27 @@ def ball(center: Any, radius: Any) -> Sdf:
 
 
 def circle(center: Any, radius: Any) -> Sdf:
-    """The disk |x - center| < radius in 2D, also called :func:`disk`; see :func:`ball`. Errors as there.
+    """The disk |x - center| < radius in 2D, also called ``disk``.
 
+    Parameters
+    ----------
+    center : array_like (2,)
+        Its centre, length units.
+    radius : float
+        Length units, positive.
+
+    Returns
+    -------
+    Sdf
+        The function x (2,) -> scalar.
+
+    Raises
+    ------
+    ValueError
+        For a radius that is not positive, or a centre that is not (2,).
+
+    Examples
+    --------
     >>> import jax.numpy as jnp, jsmitsm as js
     >>> float(js.sdf.circle((0, 0), 1.0)(jnp.array([3.0, 4.0])))
     4.0
@@ -94,10 +131,25 @@ sphere = ball
 
 
 def box(lo: Any, hi: Any) -> Sdf:
-    """The box lo < x < hi in any dimension; ``lo``, ``hi`` (D,). Exact distance.
+    """The box lo < x < hi in any dimension. Exact distance.
 
-    Raises ValueError unless hi > lo along every axis.
+    Parameters
+    ----------
+    lo, hi : array_like (D,)
+        Two opposite corners, length units.
 
+    Returns
+    -------
+    Sdf
+        The function x (D,) -> scalar.
+
+    Raises
+    ------
+    ValueError
+        Unless hi > lo along every axis.
+
+    Examples
+    --------
     >>> import jax.numpy as jnp, jsmitsm as js
     >>> float(js.sdf.box((0, 0), (2, 2))(jnp.array([5.0, 6.0])))
     5.0
@@ -111,8 +163,25 @@ def box(lo: Any, hi: Any) -> Sdf:
 
 
 def rectangle(lo: Any, hi: Any) -> Sdf:
-    """The rectangle lo < x < hi in 2D; see :func:`box`. Errors as there.
+    """The rectangle lo < x < hi in 2D. Exact distance.
 
+    Parameters
+    ----------
+    lo, hi : array_like (2,)
+        The lower left and the upper right corner, length units.
+
+    Returns
+    -------
+    Sdf
+        The function x (2,) -> scalar.
+
+    Raises
+    ------
+    ValueError
+        Unless hi > lo along both axes.
+
+    Examples
+    --------
     >>> import jax.numpy as jnp, jsmitsm as js
     >>> float(js.sdf.rectangle((0, 0), (2, 1))(jnp.array([1.0, 0.75])))
     -0.25
@@ -121,8 +190,25 @@ def rectangle(lo: Any, hi: Any) -> Sdf:
 
 
 def interval(a: Any, b: Any) -> Sdf:
-    """The interval a < x < b in 1D, a function of x (1,); see :func:`box`. Errors as there.
+    """The interval a < x < b in 1D.
 
+    Parameters
+    ----------
+    a, b : float
+        Its ends, length units.
+
+    Returns
+    -------
+    Sdf
+        The function x (1,) -> scalar.
+
+    Raises
+    ------
+    ValueError
+        Unless b > a.
+
+    Examples
+    --------
     >>> import jax.numpy as jnp, jsmitsm as js
     >>> float(js.sdf.interval(0, 2)(jnp.array([2.5])))
     0.5
@@ -131,10 +217,27 @@ def interval(a: Any, b: Any) -> Sdf:
 
 
 def half_space(point: Any, normal: Any) -> Sdf:
-    """The half-space behind the plane (in 2D the line) through ``point``; ``normal`` (D,) points out of it.
+    """The half-space behind the plane (in 2D the line) through ``point``.
 
-    ``normal`` need not be of unit length. Raises ValueError for a zero normal.
+    Parameters
+    ----------
+    point : array_like (D,)
+        A point of the plane.
+    normal : array_like (D,)
+        Points out of the half-space; of any length.
 
+    Returns
+    -------
+    Sdf
+        The function x (D,) -> scalar.
+
+    Raises
+    ------
+    ValueError
+        For a zero normal.
+
+    Examples
+    --------
     >>> import jax.numpy as jnp, jsmitsm as js
     >>> float(js.sdf.half_space((0, 0), (0, 2))(jnp.array([5.0, -3.0])))
     -3.0
@@ -148,11 +251,29 @@ def half_space(point: Any, normal: Any) -> Sdf:
 
 
 def ellipse(center: Any, semi_axes: Any) -> Sdf:
-    """The ellipse (in 3D ellipsoid) sum ((x - center) / semi_axes)^2 < 1; both (D,).
+    """The ellipse (in 3D ellipsoid) sum ((x - center) / semi_axes)^2 < 1.
 
     Not a true distance but k (k - 1) / |grad k|-like: exact zero level, first-order distance near it.
-    Raises ValueError for semi-axes that are not positive.
 
+    Parameters
+    ----------
+    center : array_like (D,)
+        Its centre, length units.
+    semi_axes : array_like (D,)
+        Half of its widths, positive.
+
+    Returns
+    -------
+    Sdf
+        The function x (D,) -> scalar.
+
+    Raises
+    ------
+    ValueError
+        For semi-axes that are not positive.
+
+    Examples
+    --------
     >>> import jax.numpy as jnp, jsmitsm as js
     >>> float(js.sdf.ellipse((0, 0), (2, 1))(jnp.array([2.0, 0.0])))
     0.0
@@ -174,10 +295,27 @@ ellipsoid = ellipse
 
 
 def capsule(a: Any, b: Any, radius: Any) -> Sdf:
-    """All points closer than ``radius`` to the segment from ``a`` to ``b`` (D,): a stadium, a rod with round ends.
+    """All points closer than ``radius`` to the segment from ``a`` to ``b``: a stadium, a rod with round ends.
 
-    Raises ValueError for a radius that is not positive.
+    Parameters
+    ----------
+    a, b : array_like (D,)
+        The ends of the segment, length units.
+    radius : float
+        Length units, positive.
 
+    Returns
+    -------
+    Sdf
+        The function x (D,) -> scalar.
+
+    Raises
+    ------
+    ValueError
+        For a radius that is not positive.
+
+    Examples
+    --------
     >>> import jax.numpy as jnp, jsmitsm as js
     >>> float(js.sdf.capsule((0, 0), (2, 0), 0.5)(jnp.array([1.0, 2.0])))
     1.5
@@ -193,10 +331,27 @@ def capsule(a: Any, b: Any, radius: Any) -> Sdf:
 
 
 def cylinder(a: Any, b: Any, radius: Any) -> Sdf:
-    """The solid cylinder of flat ends around the axis from ``a`` to ``b`` (3,). Exact distance.
+    """The solid cylinder of flat ends around the axis from ``a`` to ``b``. Exact distance.
 
-    Raises ValueError for a radius that is not positive.
+    Parameters
+    ----------
+    a, b : array_like (3,)
+        The ends of the axis, length units.
+    radius : float
+        Length units, positive.
 
+    Returns
+    -------
+    Sdf
+        The function x (3,) -> scalar.
+
+    Raises
+    ------
+    ValueError
+        For a radius that is not positive.
+
+    Examples
+    --------
     >>> import jax.numpy as jnp, jsmitsm as js
     >>> float(js.sdf.cylinder((0, 0, 0), (0, 0, 2), 1.0)(jnp.array([0.0, 3.0, 1.0])))
     2.0
@@ -215,10 +370,29 @@ def cylinder(a: Any, b: Any, radius: Any) -> Sdf:
 
 
 def torus(center: Any, major: Any, minor: Any, axis: Any = (0.0, 0.0, 1.0)) -> Sdf:
-    """The solid torus around ``center`` (3,): a tube of radius ``minor`` bent round ``axis`` with radius ``major``.
+    """The solid torus: a tube of radius ``minor`` bent round ``axis`` with radius ``major``.
 
-    Raises ValueError for radii that are not positive.
+    Parameters
+    ----------
+    center : array_like (3,)
+        Its centre, length units.
+    major, minor : float
+        The radius of the ring and that of the tube, positive.
+    axis : array_like (3,)
+        The axis of the ring, of any length.
 
+    Returns
+    -------
+    Sdf
+        The function x (3,) -> scalar.
+
+    Raises
+    ------
+    ValueError
+        For radii that are not positive.
+
+    Examples
+    --------
     >>> import jax.numpy as jnp, jsmitsm as js
     >>> float(js.sdf.torus((0, 0, 0), 2.0, 0.5)(jnp.array([2.0, 0.0, 1.5])))
     1.0
@@ -236,12 +410,29 @@ def torus(center: Any, major: Any, minor: Any, axis: Any = (0.0, 0.0, 1.0)) -> S
 
 
 def polygon(vertices: Any) -> Sdf:
-    """The polygon of ``vertices`` (V, 2) in order, either way round, last joined to first. Exact distance.
+    """The polygon of ``vertices``, last joined to first. Exact distance.
 
     The gradient is the edge's normal on an edge and the normalised bisector at a vertex. A polygon
     with holes is ``difference(polygon(outer), polygon(hole))``. Whether it crosses itself is checked
-    by :func:`jsmitsm.from_polygon`, not here. Raises ValueError for a wrong shape.
+    by ``js.from_polygon``, not here.
 
+    Parameters
+    ----------
+    vertices : array_like (V, 2)
+        In order, either way round.
+
+    Returns
+    -------
+    Sdf
+        The function x (2,) -> scalar.
+
+    Raises
+    ------
+    ValueError
+        For a wrong shape.
+
+    Examples
+    --------
     >>> import jax.numpy as jnp, jsmitsm as js
     >>> float(js.sdf.polygon([(0, 0), (2, 0), (0, 2)])(jnp.array([0.5, -1.0])))
     1.0

@@ -14,8 +14,25 @@ Sdf = Callable[[jax.Array], jax.Array]
 
 
 def union(*shapes: Sdf) -> Sdf:
-    """What lies in any of the shapes (the smallest distance; exact outside, a bound inside). ValueError without any.
+    """What lies in any of the shapes (the smallest distance; exact outside, a bound inside).
 
+    Parameters
+    ----------
+    *shapes : Sdf
+        One or more functions x (D,) -> scalar.
+
+    Returns
+    -------
+    Sdf
+        The function x (D,) -> scalar.
+
+    Raises
+    ------
+    ValueError
+        Without any shape, and for what is no function.
+
+    Examples
+    --------
     >>> import jax.numpy as jnp, jsmitsm as js
     >>> float(js.sdf.union(js.sdf.circle((0, 0), 1.0), js.sdf.circle((3, 0), 1.0))(jnp.array([3.0, 0.0])))
     -1.0
@@ -24,8 +41,25 @@ def union(*shapes: Sdf) -> Sdf:
 
 
 def intersection(*shapes: Sdf) -> Sdf:
-    """What lies in all of the shapes (the largest distance; exact inside, a bound outside). ValueError without any.
+    """What lies in all of the shapes (the largest distance; exact inside, a bound outside).
 
+    Parameters
+    ----------
+    *shapes : Sdf
+        One or more functions x (D,) -> scalar.
+
+    Returns
+    -------
+    Sdf
+        The function x (D,) -> scalar.
+
+    Raises
+    ------
+    ValueError
+        Without any shape, and for what is no function.
+
+    Examples
+    --------
     >>> import jax.numpy as jnp, jsmitsm as js
     >>> float(js.sdf.intersection(js.sdf.circle((0, 0), 1.0), js.sdf.circle((1, 0), 1.0))(jnp.array([0.5, 0.0])))
     -0.5
@@ -34,8 +68,27 @@ def intersection(*shapes: Sdf) -> Sdf:
 
 
 def difference(shape: Sdf, *holes: Sdf) -> Sdf:
-    """What lies in ``shape`` and in none of the ``holes``. ValueError for what is no function.
+    """What lies in ``shape`` and in none of the ``holes``.
 
+    Parameters
+    ----------
+    shape : Sdf
+        What is cut.
+    *holes : Sdf
+        What is cut out.
+
+    Returns
+    -------
+    Sdf
+        The function x (D,) -> scalar.
+
+    Raises
+    ------
+    ValueError
+        For what is no function.
+
+    Examples
+    --------
     >>> import jax.numpy as jnp, jsmitsm as js
     >>> float(js.sdf.difference(js.sdf.circle((0, 0), 2.0), js.sdf.circle((0, 0), 1.0))(jnp.array([1.5, 0.0])))
     -0.5
@@ -46,6 +99,18 @@ def difference(shape: Sdf, *holes: Sdf) -> Sdf:
 def complement(shape: Sdf) -> Sdf:
     """What lies outside of ``shape``.
 
+    Parameters
+    ----------
+    shape : Sdf
+        A function x (D,) -> scalar.
+
+    Returns
+    -------
+    Sdf
+        The function x (D,) -> scalar.
+
+    Examples
+    --------
     >>> import jax.numpy as jnp, jsmitsm as js
     >>> float(js.sdf.complement(js.sdf.circle((0, 0), 1.0))(jnp.array([0.0, 0.0])))
     1.0
@@ -54,10 +119,27 @@ def complement(shape: Sdf) -> Sdf:
 
 
 def smooth_union(first: Sdf, second: Sdf, radius: Any) -> Sdf:
-    """The union with its seam filled over a width ``radius`` (length units); quadratic blend, C1.
+    """The union with its seam filled; quadratic blend, C1.
 
-    Raises ValueError for a width that is not positive.
+    Parameters
+    ----------
+    first, second : Sdf
+        Functions x (D,) -> scalar.
+    radius : float
+        Width of the seam, length units, positive.
 
+    Returns
+    -------
+    Sdf
+        The function x (D,) -> scalar.
+
+    Raises
+    ------
+    ValueError
+        For a width that is not positive.
+
+    Examples
+    --------
     >>> import jax.numpy as jnp, jsmitsm as js
     >>> float(js.sdf.smooth_union(js.sdf.circle((-1, 0), 1.0), js.sdf.circle((1, 0), 1.0), 0.5)(jnp.zeros(2)))
     -0.125
@@ -73,8 +155,27 @@ def smooth_union(first: Sdf, second: Sdf, radius: Any) -> Sdf:
 
 
 def translate(shape: Sdf, offset: Any) -> Sdf:
-    """The shape moved by ``offset`` (D,). Raises ValueError for what is no vector.
+    """The shape moved by ``offset``.
 
+    Parameters
+    ----------
+    shape : Sdf
+        A function x (D,) -> scalar.
+    offset : array_like (D,)
+        Length units.
+
+    Returns
+    -------
+    Sdf
+        The function x (D,) -> scalar.
+
+    Raises
+    ------
+    ValueError
+        For what is no vector.
+
+    Examples
+    --------
     >>> import jax.numpy as jnp, jsmitsm as js
     >>> float(js.sdf.translate(js.sdf.circle((0, 0), 1.0), (3, 0))(jnp.array([3.0, 0.0])))
     -1.0
@@ -84,8 +185,29 @@ def translate(shape: Sdf, offset: Any) -> Sdf:
 
 
 def scale(shape: Sdf, factor: Any, center: Any = None) -> Sdf:
-    """The shape enlarged by ``factor`` > 0 about ``center`` (the origin by default). ValueError for another factor.
+    """The shape enlarged by ``factor`` about ``center``.
 
+    Parameters
+    ----------
+    shape : Sdf
+        A function x (D,) -> scalar.
+    factor : float
+        Positive.
+    center : array_like (D,), optional
+        What stays in its place, the origin by default.
+
+    Returns
+    -------
+    Sdf
+        The function x (D,) -> scalar.
+
+    Raises
+    ------
+    ValueError
+        For a factor that is not positive.
+
+    Examples
+    --------
     >>> import jax.numpy as jnp, jsmitsm as js
     >>> float(js.sdf.scale(js.sdf.circle((0, 0), 1.0), 3.0)(jnp.zeros(2)))
     -3.0
@@ -96,11 +218,31 @@ def scale(shape: Sdf, factor: Any, center: Any = None) -> Sdf:
 
 
 def rotate(shape: Sdf, angle: Any, center: Any = None, axis: Any = None) -> Sdf:
-    """The shape turned by ``angle`` (radians, counter-clockwise) about ``center`` (the origin by default).
+    """The shape turned about ``center``; in 3D about the line through it along ``axis``, by the right-hand rule.
 
-    In 3D about the line through ``center`` along ``axis`` (3,), by the right-hand rule.
-    Raises ValueError, when called, for a 3D point without an axis and for a 2D one with it.
+    Parameters
+    ----------
+    shape : Sdf
+        A function x (D,) -> scalar.
+    angle : float
+        Radians, counter-clockwise.
+    center : array_like (D,), optional
+        What stays in its place, the origin by default.
+    axis : array_like (3,), optional
+        Needed in 3D, and there alone.
 
+    Returns
+    -------
+    Sdf
+        The function x (D,) -> scalar.
+
+    Raises
+    ------
+    ValueError
+        When called, for a 3D point without an axis and for a 2D one with it.
+
+    Examples
+    --------
     >>> import jax.numpy as jnp, jsmitsm as js
     >>> upright = js.sdf.rotate(js.sdf.rectangle((0, 0), (2, 1)), jnp.pi / 2)
     >>> print(f"{upright(jnp.array([-0.5, 1.0])):.3f}")
@@ -129,8 +271,26 @@ def round(shape: Sdf, radius: Any) -> Sdf:
     """The shape grown by ``radius``, its convex corners rounded with it (exact distances only).
 
     To keep the size, shrink the shape first: ``round(box(lo + r, hi - r), r)``.
-    Raises ValueError for a radius that is not positive.
 
+    Parameters
+    ----------
+    shape : Sdf
+        A function x (D,) -> scalar.
+    radius : float
+        Length units, positive.
+
+    Returns
+    -------
+    Sdf
+        The function x (D,) -> scalar.
+
+    Raises
+    ------
+    ValueError
+        For a radius that is not positive.
+
+    Examples
+    --------
     >>> import jax.numpy as jnp, jsmitsm as js
     >>> float(js.sdf.round(js.sdf.rectangle((0, 0), (2, 1)), 0.25)(jnp.array([1.0, 2.0])))
     0.75
@@ -142,8 +302,25 @@ def round(shape: Sdf, radius: Any) -> Sdf:
 def shell(shape: Sdf, thickness: Any) -> Sdf:
     """The wall of the given thickness with the boundary of ``shape`` in its middle.
 
-    Raises ValueError for a thickness that is not positive.
+    Parameters
+    ----------
+    shape : Sdf
+        A function x (D,) -> scalar.
+    thickness : float
+        Length units, positive.
 
+    Returns
+    -------
+    Sdf
+        The function x (D,) -> scalar.
+
+    Raises
+    ------
+    ValueError
+        For a thickness that is not positive.
+
+    Examples
+    --------
     >>> import jax.numpy as jnp, jsmitsm as js
     >>> float(js.sdf.shell(js.sdf.circle((0, 0), 1.0), 0.5)(jnp.array([1.0, 0.0])))
     -0.25

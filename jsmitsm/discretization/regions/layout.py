@@ -46,7 +46,7 @@ class Meeting:
 
 @dataclass
 class Regions:
-    """A problem with several regions on its cloud; what :class:`Discretization` is to one.
+    """A problem with several regions on its cloud; what ``Discretization`` is to one.
 
     Values, held ones and unknowns are numbered as in the whole cloud.
     """

@@ -22,7 +22,8 @@ def softened(disc: Discretization, ids: np.ndarray, source: Any, values: Any) ->
     """The source's Taylor coefficients (rows, n) at the particles ``ids``, without the series that mislead.
 
     values (E, N): the source at all particles. Beside a kink a series tells of one side only, and the deeper the
-    recursion goes the more it makes of it. What is smooth, resolved or not, stays as it is.
+    recursion goes the more it makes of it. What is smooth, resolved or not, stays as it is. Where coefficients have
+    kinks as well the source stays: both may belong together, and the series of one side are those of a solution on it.
     """
     xp = jnp if is_traced(source, values, disc.points) or any(is_traced(c.neighbours) for c in disc.classes) else np
     source, place = xp.asarray(source), np.full(len(disc.cloud), -1)

@@ -147,6 +147,8 @@ def between(problem: Problem, name: str, points: Any, normals: Any) -> Between:
             _linearised(flux, points, normals, problem.params, None if flux.linear else derivatives[place], where)
             for flux, place in zip((first, second), places)
         ]
+        if fields == 1:
+            _check_signs(first, second, made, normals, name)
         resistance = given["resistance"]
         if resistance is not None:
             resistance = component(problem, points, resistance, 0, 0, f"{where}.resistance")()
@@ -163,6 +165,22 @@ def _check_flux(flux: Traced, fields: int, where: str) -> None:
         raise ValueError(f"{where}: does not depend on u; return +k n . grad u (or +traction)")
     if max(sum(b) for _, b in flux.slots) > 1:
         raise ValueError(f"{where}: holds derivatives beyond the first, which fluxes of second-order equations lack")
+
+
+def _check_signs(first: Traced, second: Traced, made: Any, normals: Any, name: str) -> None:
+    """Both fluxes count along the same normal: ValueError where they grow with the slope in opposite senses."""
+    if is_traced(made, normals):
+        return
+    along = []
+    for flux, (jac, _) in zip((first, second), made):
+        slots = [(k, b.index(1)) for k, (_, b) in enumerate(flux.slots) if sum(b) == 1]
+        along.append(sum(np.asarray(jac)[0, k] * np.asarray(normals)[:, axis] for k, axis in slots))
+    if np.ndim(along[0]) and np.ndim(along[1]) and (along[0] * along[1] < 0).all():
+        raise ValueError(
+            f"bcs[{name!r}].flux: of opposite signs on the two sides, but both are +k n . grad u with the same n, "
+            f"which points from {name.split('|')[0]!r} to {name.split('|')[1]!r}; where a conductivity is meant to be "
+            "negative, state it as a residual"
+        )
 
 
 def _linearised(flux: Traced, points: Any, normals: Any, params: Any, at: Any, where: str) -> tuple[Any, Any]:

@@ -26,16 +26,26 @@ def interface(
 
     Parameters
     ----------
-    flux : maps the names of both regions to functions ``(u, x, n)`` (and ``params`` last, where given) that return
-        +k n . grad u, for elasticity +traction; (F,) for a system. ``n`` is the same for both, from a to b.
-    jump : u_a - u_b, a number, an array over the pairs of the interface (P,) or a function of x (and of params); for a
+    flux : mapping of two functions, optional
+        Maps the names of both regions to functions ``(u, x, n)`` (and ``params`` last, where given) that return +k
+        n . grad u, for elasticity +traction; (F,) for a system. ``n`` is the same for both, from a to b.
+    jump : float, array or function
+        u_a - u_b, a number, an array over the pairs of the interface (P,) or a function of x (and of params); for a
         system for all fields, (F,), (P, F) or a function returning (F,).
-    source : what the interface feeds in (heat per area for k n . grad u), as ``jump``.
-    resistance : of an imperfect contact, a number, an array over the pairs or a function of x; none if not given.
-        In heat conduction with k n . grad u the temperature falls in the direction of n where the gradient points
-        against it, u_a - u_b = -resistance k n . grad u: a resistance is positive.
-    residual : in place of all others ``residual(a, b, x, n)`` (and ``params`` last), with the local fields a and b of
-        both sides, returning the two conditions, (2 F,) for a system; nonlinear ones too.
+    source : float, array or function
+        What the interface feeds in (heat per area for k n . grad u), as ``jump``.
+    resistance : float, array or function, optional
+        Of an imperfect contact, a number, an array over the pairs or a function of x; none if not given. In heat
+        conduction with k n . grad u the temperature falls in the direction of n where the gradient points against
+        it, u_a - u_b = -resistance k n . grad u: a resistance is positive.
+    residual : function, optional
+        In place of all others ``residual(a, b, x, n)`` (and ``params`` last), with the local fields a and b of both
+        sides, returning the two conditions, (2 F,) for a system; nonlinear ones too.
+
+    Returns
+    -------
+    Condition
+        To be put under ``"a|b"`` in ``bcs``.
 
     Raises
     ------

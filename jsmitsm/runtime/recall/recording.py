@@ -3,9 +3,9 @@
 JAX remembers functions by identity, so that a lambda written anew is recorded anew, and one that
 reads a changed global is not. Here a function is remembered by its code and by the values that the
 code can reach. Numbers, arrays, containers and functions made of such are followed; what JAX, NumPy
-and Python bring along is taken as it is where it is proven to have no state (:mod:`jsmitsm.runtime.recall.stateless`).
+and Python bring along is taken as it is where it is proven to have no state (``jsmitsm.runtime.recall.stateless``).
 Everything else (an object with attributes, a generator, a file, what is looked up by a name made at run
-time) is :class:`Unknown`, and such a function is recorded at every use: that takes milliseconds.
+time) is ``Unknown``, and such a function is recorded at every use: that takes milliseconds.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class _Same:
 
 
 def identity(function: Callable[..., Any]) -> Any:
-    """A hashable that is equal for functions which do the same; raises :class:`Unknown`."""
+    """A hashable that is equal for functions which do the same; raises ``Unknown``."""
     return _value(function, {})
 
 

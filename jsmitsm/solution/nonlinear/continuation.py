@@ -20,7 +20,7 @@ from jsmitsm.solution.solve import solve
 
 
 class StageOptions(SolveOptions, total=False):
-    """Options of :func:`jsmitsm.solve` for every stage."""
+    """Options of ``js.solve`` for every stage."""
 
     kernel: Kernel | None
 
@@ -58,15 +58,22 @@ def continuation(
 
     Parameters
     ----------
-    problem : function of one number that returns the problem to solve.
-    parameters : the stages, in the order in which to go; two or more.
-    u0 : start of the first stage, as in :func:`jsmitsm.solve`; ``options`` are passed to it.
-    arclength : follow the branch of solutions by its arc length (Keller 1977), which passes turning
-        points. The second parameter says in which direction to set out, and each is that at which the
-        branch passes it after the one before: [1.0, 2.0, 2.0] are the solutions at 2 before the turning
-        point and behind it.
-    steps : with ``arclength``, the most steps along the branch; it ends there, or where the last
-        parameter was passed.
+    problem : Problem
+        Function Of one number; returns the problem to solve.
+    cloud : Cloud
+        The particles it is solved on.
+    parameters : str or sequence of str
+        Sequence of float The stages, in the order in which to go; two or more.
+    u0 : array_like or function, optional
+        Start of the first stage, as in ``js.solve``.
+    arclength : bool
+        Follow the branch of solutions by its arc length (Keller 1977), which passes turning points. The second
+        parameter says in which direction to set out, and each is that at which the branch passes it after the one
+        before: [1.0, 2.0, 2.0] are the solutions at 2 before the turning point and behind it.
+    steps : int
+        With ``arclength``, the most steps along the branch; it ends there, or where the last parameter was passed.
+    **options : optional
+        Passed to ``js.solve``.
 
     Returns
     -------

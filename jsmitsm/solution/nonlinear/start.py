@@ -40,7 +40,7 @@ def start(disc: Discretization, problem: Problem, u0: Any) -> tuple[Any, Any]:
 
 
 def harmonic(disc: Discretization) -> tuple[np.ndarray, np.ndarray] | None:
-    """What :func:`start` gives for values that spread from the held ones into the cloud; None where that is flat.
+    """What ``start`` gives for values that spread from the held ones into the cloud; None where that is flat.
 
     Every value is the mean of its neighbours', which for linear data on a lattice is the linear function.
     """

@@ -101,7 +101,7 @@ class Frozen:
 
 
 def advance(run: Run, taylor: Any, altered: Callable[..., Any] | None = None) -> Iterate:
-    """One full step from the expansions; ``altered`` may change the linear system (see :meth:`Run.step`)."""
+    """One full step from the expansions; ``altered`` may change the linear system (see ``Run.step``)."""
     nums = run.numbers(taylor)
     values, _ = run.step(nums, altered)
     return Iterate(values, run.expanded(nums, values))

@@ -22,7 +22,7 @@ from jsmitsm.taylor.multi_indices import HIGHEST, multi_indices
 
 @jax.tree_util.register_pytree_node_class
 class RegionsFit:
-    """What it takes to fit the local polynomials of a solution again; see :class:`jsmitsm.solution.fit.Fit`."""
+    """What it takes to fit the local polynomials of a solution again; see ``jsmitsm.solution.fit.Fit``."""
 
     def __init__(self, problem: Any, cloud: Any, neighbours: Any, taylor: Any, recipe: Recipe):
         self.problem, self.cloud = problem, cloud

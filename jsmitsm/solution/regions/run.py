@@ -35,7 +35,7 @@ from jsmitsm.solution.run import Run
 
 
 class RegionsRun(Run):
-    """What :class:`Run` is to a problem of one region; ``disc`` is a :class:`Regions`."""
+    """What ``Run`` is to a problem of one region; ``disc`` is a ``Regions``."""
 
     disc: Any
     nums: Any
@@ -167,7 +167,8 @@ class RegionsRun(Run):
                 test(view, values[part.ids], own, told, {})
             doubts += [f"In the region {part.name!r}: {line[0].lower()}{line[1:]}" for line in told]
         told = [*weak_copies(self.bound), *singular(self.disc, values)]
-        return [*certain, *(doubts if estimated() > flags.CLEARED else []), *told, *self.against]
+        cleared = len(values) <= flags.MANY and estimated() <= flags.CLEARED
+        return [*certain, *([] if cleared else doubts), *told, *self.against]
 
     def stats(self) -> dict[str, Any]:
         """What a user may want to know about the solve."""

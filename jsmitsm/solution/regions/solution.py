@@ -21,12 +21,14 @@ from jsmitsm.solution.solution import Solution
 
 @jax.tree_util.register_pytree_node_class
 class RegionsSolution(Solution):
-    """A solution in several regions: a :class:`jsmitsm.Solution` whose values jump where the problem says so.
+    """A solution in several regions: a ``js.Solution`` whose values jump where the problem says so.
 
     ``sol(points)`` takes the region in which each point lies, as the particles of the interfaces tell;
     ``sol(points, region="a")`` the expansions of that region, on the interface its side of it. ``sol.region("a")`` is
     the solution of one region alone. Integrals and fluxes over an interface ``"a|b"`` take the side ``region``.
 
+    Examples
+    --------
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jsmitsm as js
     >>> cloud = js.regions({"a": (0.0, 0.5), "b": (0.5, 1.0)}, spacing=0.125)
@@ -41,7 +43,36 @@ class RegionsSolution(Solution):
     cloud: Any
 
     def region(self, name: str) -> Solution:
-        """The solution of one region, on its own cloud with outward normals. ValueError for other names."""
+        """The solution of one region, on its own cloud with outward normals.
+
+        Parameters
+        ----------
+        name : str
+            Of the region.
+
+        Returns
+        -------
+        Solution
+            Of that region alone.
+
+        Raises
+        ------
+        ValueError
+            For other names.
+
+        Examples
+        --------
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import jsmitsm as js
+        >>> cloud = js.regions({"a": (0.0, 0.5), "b": (0.5, 1.0)}, spacing=0.125)
+        >>> k = {"a": 1.0, "b": 3.0}
+        >>> flux = {name: lambda u, x, n, k=k[name]: k * n @ js.grad(u)(x) for name in k}
+        >>> bcs = {"boundary": js.dirichlet(lambda x: x[0]), "a|b": js.interface(flux=flux)}
+        >>> problem = js.Problem({name: lambda u, x: js.laplacian(u)(x) for name in k}, bcs)
+        >>> sol = js.solve(problem, cloud)
+        >>> len(sol.region("a").u)
+        5
+        """
         self.refuse_stacked()
         cloud, ids = self.cloud.region(name), self.cloud.regions[name]
         fitted = None if self._fitted is None else self._fitted[ids]
@@ -65,13 +96,79 @@ class RegionsSolution(Solution):
     def __call__(
         self, points: ArrayLike, *, region: str | None = None, blend: bool = False, outside: str = "nan"
     ) -> jax.Array:
-        """Values (M,) or (M, F) at ``points`` (M, D), of the region in which each lies or of ``region``."""
+        """Values anywhere.
+
+        Parameters
+        ----------
+        points : array_like (M, D)
+            Where.
+        region : str, optional
+            The region whose polynomials are taken; that in which each point lies if not given.
+        blend, outside : optional
+            As for ``js.Solution``.
+
+        Returns
+        -------
+        jax.Array
+            (M,), for a system (M, F).
+
+        Raises
+        ------
+        ValueError
+            For other names, and for points that are traced without ``region``.
+
+        Examples
+        --------
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import jsmitsm as js
+        >>> cloud = js.regions({"a": (0.0, 0.5), "b": (0.5, 1.0)}, spacing=0.125)
+        >>> k = {"a": 1.0, "b": 3.0}
+        >>> flux = {name: lambda u, x, n, k=k[name]: k * n @ js.grad(u)(x) for name in k}
+        >>> bcs = {"boundary": js.dirichlet(lambda x: x[0]), "a|b": js.interface(flux=flux)}
+        >>> problem = js.Problem({name: lambda u, x: js.laplacian(u)(x) for name in k}, bcs)
+        >>> sol = js.solve(problem, cloud)
+        >>> round(float(sol([[0.5]], region="a")[0]), 9)
+        0.75
+        """
         return self.derivative(points, (0,) * self.cloud.dim, region=region, blend=blend, outside=outside)
 
     def grad(
         self, points: ArrayLike, *, region: str | None = None, blend: bool = False, outside: str = "nan"
     ) -> jax.Array:
-        """Gradients (M, D) or (M, F, D) at ``points`` (M, D)."""
+        """Gradients anywhere.
+
+        Parameters
+        ----------
+        points : array_like (M, D)
+            Where.
+        region : str, optional
+            The region whose polynomials are taken; that in which each point lies if not given.
+        blend, outside : optional
+            As for ``js.Solution``.
+
+        Returns
+        -------
+        jax.Array
+            (M, D), for a system (M, F, D).
+
+        Raises
+        ------
+        ValueError
+            For other names, and for points that are traced without ``region``.
+
+        Examples
+        --------
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import jsmitsm as js
+        >>> cloud = js.regions({"a": (0.0, 0.5), "b": (0.5, 1.0)}, spacing=0.125)
+        >>> k = {"a": 1.0, "b": 3.0}
+        >>> flux = {name: lambda u, x, n, k=k[name]: k * n @ js.grad(u)(x) for name in k}
+        >>> bcs = {"boundary": js.dirichlet(lambda x: x[0]), "a|b": js.interface(flux=flux)}
+        >>> problem = js.Problem({name: lambda u, x: js.laplacian(u)(x) for name in k}, bcs)
+        >>> sol = js.solve(problem, cloud)
+        >>> round(float(sol.grad([[0.5]], region="b")[0, 0]), 9)
+        0.5
+        """
         unit = [tuple(map(int, b)) for b in np.eye(self.cloud.dim, dtype=int)]
         made = [self.derivative(points, b, region=region, blend=blend, outside=outside) for b in unit]
         return jnp.stack(made, axis=-1)
@@ -80,7 +177,42 @@ class RegionsSolution(Solution):
         self, points: ArrayLike, multi_index: Sequence[int], *, region: str | None = None, blend: bool = False,
         outside: str = "nan",
     ) -> jax.Array:  # fmt: skip
-        """The derivative d^b u at ``points`` (M, D), b = ``multi_index``: (M,) or (M, F)."""
+        """Any derivative d^b u anywhere.
+
+        Parameters
+        ----------
+        points : array_like (M, D)
+            Where.
+        multi_index : sequence of int (D,)
+            b, the order along each axis.
+        region : str, optional
+            The region whose polynomials are taken; that in which each point lies if not given.
+        blend, outside : optional
+            As for ``js.Solution``.
+
+        Returns
+        -------
+        jax.Array
+            (M,), for a system (M, F).
+
+        Raises
+        ------
+        ValueError
+            For other names, and for points that are traced without ``region``.
+
+        Examples
+        --------
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import jsmitsm as js
+        >>> cloud = js.regions({"a": (0.0, 0.5), "b": (0.5, 1.0)}, spacing=0.125)
+        >>> k = {"a": 1.0, "b": 3.0}
+        >>> flux = {name: lambda u, x, n, k=k[name]: k * n @ js.grad(u)(x) for name in k}
+        >>> bcs = {"boundary": js.dirichlet(lambda x: x[0]), "a|b": js.interface(flux=flux)}
+        >>> problem = js.Problem({name: lambda u, x: js.laplacian(u)(x) for name in k}, bcs)
+        >>> sol = js.solve(problem, cloud)
+        >>> round(float(sol.derivative([[0.25]], (1,))[0]), 9)
+        1.5
+        """
         self.refuse_stacked()
         if region is not None:
             return self._one(region).derivative(points, multi_index, blend=blend, outside=outside)
@@ -100,7 +232,38 @@ class RegionsSolution(Solution):
         return out
 
     def integral(self, group: str | None = None, *, region: str | None = None) -> jax.Array:
-        """The integral of u over the domain or a region, over a boundary group, or over one side of an interface."""
+        """The integral of u over the domain or a region, over a boundary group, or over one side of an interface.
+
+        Parameters
+        ----------
+        group : str, optional
+            A boundary group or an interface ``"a|b"``; the domain if not given.
+        region : str, optional
+            The region; for an interface the side, which must be named.
+
+        Returns
+        -------
+        jax.Array
+            A scalar, for a system (F,).
+
+        Raises
+        ------
+        ValueError
+            For other names.
+
+        Examples
+        --------
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import jsmitsm as js
+        >>> cloud = js.regions({"a": (0.0, 0.5), "b": (0.5, 1.0)}, spacing=0.125)
+        >>> k = {"a": 1.0, "b": 3.0}
+        >>> flux = {name: lambda u, x, n, k=k[name]: k * n @ js.grad(u)(x) for name in k}
+        >>> bcs = {"boundary": js.dirichlet(lambda x: x[0]), "a|b": js.interface(flux=flux)}
+        >>> problem = js.Problem({name: lambda u, x: js.laplacian(u)(x) for name in k}, bcs)
+        >>> sol = js.solve(problem, cloud)
+        >>> round(float(sol.integral(region="a")), 9)
+        0.1875
+        """
         self.refuse_stacked()
         total: Any = 0.0
         for name in self._those(group, region):
@@ -108,9 +271,41 @@ class RegionsSolution(Solution):
         return total
 
     def flux(self, group: str, conductivity: ValueOrFunction = 1.0, *, region: str | None = None) -> jax.Array:
-        """The integral of conductivity n . grad u over a boundary group or one side (``region``) of an interface.
+        """The integral of conductivity n . grad u over a boundary group or one side of an interface.
 
-        ``n`` points outward, on an interface "a|b" from a to b for both sides.
+        ``n`` points outward, on an interface ``"a|b"`` from a to b for both sides.
+
+        Parameters
+        ----------
+        group : str
+            A boundary group or an interface ``"a|b"``.
+        conductivity : float or function
+            A number, or a function of one point x (D,).
+        region : str, optional
+            The region; for an interface the side, which must be named.
+
+        Returns
+        -------
+        jax.Array
+            A scalar, for a system (F,).
+
+        Raises
+        ------
+        ValueError
+            For other names.
+
+        Examples
+        --------
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import jsmitsm as js
+        >>> cloud = js.regions({"a": (0.0, 0.5), "b": (0.5, 1.0)}, spacing=0.125)
+        >>> k = {"a": 1.0, "b": 3.0}
+        >>> flux = {name: lambda u, x, n, k=k[name]: k * n @ js.grad(u)(x) for name in k}
+        >>> bcs = {"boundary": js.dirichlet(lambda x: x[0]), "a|b": js.interface(flux=flux)}
+        >>> problem = js.Problem({name: lambda u, x: js.laplacian(u)(x) for name in k}, bcs)
+        >>> sol = js.solve(problem, cloud)
+        >>> round(float(sol.flux("a|b", 3.0, region="b")), 9)
+        1.5
         """
         self.refuse_stacked()
         total: Any = 0.0

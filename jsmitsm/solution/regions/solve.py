@@ -50,7 +50,7 @@ def prepared_regions(
 
 
 def solve_regions(problem: Any, cloud: Any, *, u0: Any = None, **options: Any) -> RegionsSolution:
-    """The solution of a problem with several regions; options as those of :func:`jsmitsm.solve`."""
+    """The solution of a problem with several regions; options as those of ``js.solve``."""
     run = prepared_regions(problem, cloud, u0=u0, **options)
     if run.disc.linear:
         values, good = run.step(run.numbers())

@@ -14,6 +14,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm.cloud.cloud import Cloud
@@ -47,6 +48,12 @@ class Timed:
     quasilinear: bool
 
     @property
+    def operator(self) -> Traced:
+        """The record of L."""
+        assert isinstance(self.problem.pde, Traced)
+        return self.problem.pde
+
+    @property
     def linear(self) -> bool:
         return not self.rest.slots
 
@@ -61,21 +68,13 @@ class Timed:
         """Coefficients (N, E, F) of the rates of this order."""
         record = self.masses[order - 1]
         n, fields = len(points), self.problem.fields
-        out = np.zeros((n, fields, fields))
-        if not record.slots:
-            return out
-        jac, _ = record.coefficients(points, 0, params=params)
-        jac = jac[:, :, 0]
-        if not is_traced(jac):
+        columns: list[Any] = [np.zeros((n, fields))] * fields
+        if record.slots:
+            jac, _ = record.coefficients(points, 0, params=params)
+            xp = jnp if is_traced(jac) else np
             for s, (k, _) in enumerate(record.slots):
-                out[:, :, k % RATE] = np.broadcast_to(jac[:, s], (fields, n)).T
-            return out
-        import jax.numpy as jnp
-
-        out = jnp.zeros(out.shape)
-        for s, (k, _) in enumerate(record.slots):
-            out = out.at[:, :, k % RATE].set(jnp.broadcast_to(jac[:, s], (fields, n)).T)
-        return out
+                columns[k % RATE] = xp.broadcast_to(jac[:, s, 0], (fields, n)).T
+        return (jnp if is_traced(columns) else np).stack(columns, axis=2)
 
 
 def timed(problem: Problem, cloud: Cloud) -> Timed:

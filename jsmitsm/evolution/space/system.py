@@ -7,7 +7,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from jsmitsm.evolution.matrices import ComplexFactor, RealFactor, Sparse, combined
+from jsmitsm.evolution.space.matrices import ComplexFactor, RealFactor, Sparse, combined
 from jsmitsm.linear import linsolve
 from jsmitsm.runtime.tracers import is_traced
 

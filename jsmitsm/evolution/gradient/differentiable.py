@@ -7,12 +7,12 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from jsmitsm.evolution import dense_output
-from jsmitsm.evolution.adjoint import Inputs, Plan, states
 from jsmitsm.evolution.evolution import Evolution
-from jsmitsm.evolution.pushing import Pushing
+from jsmitsm.evolution.gradient.adjoint import Inputs, Plan, states
+from jsmitsm.evolution.gradient.pushing import Pushing
 from jsmitsm.evolution.run import Run
-from jsmitsm.evolution.tableaux import EULER, KENCARP4
+from jsmitsm.evolution.steps import dense_output
+from jsmitsm.evolution.steps.tableaux import EULER, KENCARP4
 from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.solution.fit import Recipe
 from jsmitsm.taylor.multi_indices import HIGHEST
@@ -60,9 +60,8 @@ def differentiable(run: Run, steps: int, parts: np.ndarray) -> Evolution:
     u = whole(found[:, :size], of_held(samples[0]))
     rates = whole(found[:, size:], of_held(samples[3])) if semi.second else None
     recipe = Recipe("S", run.order, None, "loo", run.fields, min(2, HIGHEST - run.order))
-    good = jnp.isfinite(u).all()
-    if not is_traced(good):
-        good = bool(good)
+    finite = jnp.isfinite(u).all()
+    good = finite if is_traced(finite) else bool(finite)
     return Evolution(t0 + (t1 - t0) * parts, u, rates, run.cloud, recipe, good, {"scheme": scheme.name, "steps": steps})
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from jsmitsm.evolution.semidiscrete import Semidiscrete
+from jsmitsm.evolution.space.semidiscrete import Semidiscrete
 
 # Cell Peclet numbers |v| h / eps: up to the first the recursion is stable, beyond the second nothing is.
 MODERATE, MOST = 2.0, 5.0
@@ -14,7 +14,7 @@ MODERATE, MOST = 2.0, 5.0
 
 def refuse_convection(semi: Semidiscrete, flags: list[str]) -> None:
     """ValueError where convection outweighs diffusion between neighbours; a flag where it comes near."""
-    operator, problem = semi.timed.problem.pde, semi.timed.problem
+    operator, problem = semi.timed.operator, semi.timed.problem
     whole = semi.timed.space
     for e, row in enumerate(whole.pattern):
         rates = any(p for m in semi.timed.masses for p in (m.pattern[e] if m.slots else ()))

@@ -36,7 +36,7 @@ def _sampling(matrix: np.ndarray, at: np.ndarray, nodes: np.ndarray, consistent:
 class Additive:
     """A stiffly accurate scheme with an explicit first stage, one implicit coefficient, and an explicit companion.
 
-    implicit, explicit (s, s); nodes (s,); weights (s,), shared by both halves; embedded (s,) or None, of one order less.
+    implicit, explicit (s, s); nodes (s,); weights (s,), of both halves; embedded (s,) or None, of one order less.
     """
 
     name: str

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from functools import cached_property
+from dataclasses import dataclass
+from functools import cached_property, partial
 from typing import Any
 
 import jax
@@ -12,6 +13,9 @@ import numpy as np
 from jsmitsm.linear import linsolve
 from jsmitsm.runtime.collector import uncollected
 from jsmitsm.runtime.tracers import is_traced
+
+# Entries that are taken together, few enough to stay in cache.
+CHUNK = 1024
 
 
 class Sparse:
@@ -36,6 +40,8 @@ class Sparse:
         """The product with x (n,) or (n, m), by scipy or, where anything is traced, by JAX."""
         if not is_traced(self.values, x):
             return self.host @ np.asarray(x)
+        if np.ndim(x) == 2:
+            return _product(_Form(self.rows, self.cols, self.shape), self.values, x)
         return _times(self.values, self.rows, self.cols, jnp.asarray(x), self.shape[0])
 
     def with_values(self, values: Any) -> Sparse:
@@ -56,6 +62,48 @@ def _times(values: Any, rows: Any, cols: Any, x: Any, n: int) -> Any:
 
 
 _times = jax.jit(_times, static_argnums=4)
+
+
+@dataclass(eq=False)
+class _Form:
+    """A matrix without its values."""
+
+    rows: np.ndarray
+    cols: np.ndarray
+    shape: tuple[int, int]
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(0,))
+def _product(form: _Form, values: Any, x: Any) -> Any:
+    """Many products: by scipy wherever only derivatives are traced, so that nothing of entries by columns is made."""
+    if is_traced(values, x):
+        return _times(values, form.rows, form.cols, jnp.asarray(x), form.shape[0])
+    return jnp.asarray(Sparse(values, form.rows, form.cols, form.shape).host @ np.asarray(x))
+
+
+def _product_forward(form: _Form, values: Any, x: Any) -> tuple[Any, Any]:
+    return _product(form, values, x), (values, x)
+
+
+def _product_backward(form: _Form, kept: Any, bar: Any) -> tuple[Any, Any]:
+    values, x = kept
+    if is_traced(kept, bar):
+        _, back = jax.vjp(lambda v, y: _times(v, form.rows, form.cols, y, form.shape[0]), values, jnp.asarray(x))
+        return back(bar)
+    matrix, bar = Sparse(values, form.rows, form.cols, form.shape), np.asarray(bar)
+    return jnp.asarray(sampled(matrix, bar, np.asarray(x))), jnp.asarray(matrix.host_transposed @ bar)
+
+
+_product.defvjp(_product_forward, _product_backward)
+
+
+def sampled(matrix: Sparse, left: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """The entries of left right^T, (n, m) and (k, m), at the places of a matrix."""
+    out = np.empty(len(matrix.rows))
+    for k in range(0, len(out), CHUNK):
+        some = slice(k, k + CHUNK)
+        np.einsum("ej,ej->e", left[matrix.rows[some]], right[matrix.cols[some]], out=out[some])
+    return out
 
 
 def combined(parts: list[tuple[Any, Sparse]]) -> tuple[Any, np.ndarray, np.ndarray]:

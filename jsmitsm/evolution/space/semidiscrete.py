@@ -12,11 +12,11 @@ import numpy as np
 from jsmitsm.discretization.coefficients import conditions_of
 from jsmitsm.discretization.pencil.assemble import Pencil
 from jsmitsm.discretization.pencil.local import source_stencils
-from jsmitsm.evolution.local_fits import LocalFits
-from jsmitsm.evolution.matrices import Sparse
-from jsmitsm.evolution.system import System
-from jsmitsm.evolution.tableaux import Sampling
-from jsmitsm.evolution.timed import Timed
+from jsmitsm.evolution.space.local_fits import LocalFits
+from jsmitsm.evolution.space.matrices import Sparse
+from jsmitsm.evolution.space.system import System
+from jsmitsm.evolution.space.timed import Timed
+from jsmitsm.evolution.steps.tableaux import Sampling
 from jsmitsm.runtime.collector import uncollected
 from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.taylor.multi_indices import count
@@ -34,7 +34,8 @@ class Semidiscrete:
     def __init__(self, timed: Timed, pencil: Pencil, params: Any, damping: float = 0.0, reference: Any = None):
         self.timed, self.pencil, self.params = timed, pencil, params
         # What of N counts as the nonlinear part, and its coefficients (E, S, N) that the pencil has already.
-        self.rest, self.reference = (timed.rest, None) if reference is None else (timed.space, reference)
+        self.rest = timed.rest if reference is None else timed.space
+        self.reference: Any = reference
         self.disc = disc = pencil.layout.disc
         self.n, self.fields = len(disc.cloud), timed.problem.fields
         self.free, self.held = pencil.free, pencil.held
@@ -102,7 +103,8 @@ class Semidiscrete:
         kept[self.held] = 0.0
         concrete = Sparse(jax.lax.stop_gradient(mass.values), mass.rows, mass.cols, mass.shape)
         product = (amount * (concrete.host @ sparse.diags_array(kept) @ every)).tocoo()
-        return Sparse(product.data, *(c.astype(int) for c in product.coords), mass.shape)
+        rows, cols = (c.astype(int) for c in product.coords)
+        return Sparse(product.data, rows, cols, mass.shape)
 
     def _times_mass(self, source: Sparse, order: int) -> Sparse:
         """B M: the source of a particle's equation from the rates of its fields."""
@@ -193,6 +195,7 @@ class Semidiscrete:
 
     def placed(self, part: Any, held: Any) -> Any:
         """Values (N, F) from those of free and of held ones."""
+        flat: Any
         if is_traced(part, held):
             flat = jnp.zeros(self.n * self.fields).at[self.free].set(part).at[self.held].set(held)
         else:
@@ -273,7 +276,8 @@ class Driver:
     def __init__(self, semi: Semidiscrete, sampling: Sampling):
         self.semi, self.sampling = semi, sampling
         self._last: tuple[float, list[Any]] | None = None
-        self._starts, self._h, self._block = np.zeros(0), 0.0, (0, 0, [])
+        self._starts, self._h = np.zeros(0), 0.0
+        self._block: tuple[int, int, list[Any]] = (0, 0, [])
 
     def plan(self, starts: np.ndarray, h: float) -> None:
         """Steps to come, of one size."""

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from jsmitsm.evolution.stepping import Step, Stopped
+from jsmitsm.evolution.steps.stepping import Step, Stopped
 from jsmitsm.runtime.errors import SolveError
 
 # The smallest step is so many halvings of the whole.

@@ -16,8 +16,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from jsmitsm.evolution.system import System
-from jsmitsm.evolution.tableaux import RADAU, Additive
+from jsmitsm.evolution.space.system import System
+from jsmitsm.evolution.steps.tableaux import RADAU, Additive
 
 
 class Drive(Protocol):

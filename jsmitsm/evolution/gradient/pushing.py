@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jsmitsm.evolution.semidiscrete import Semidiscrete
+from jsmitsm.evolution.space.semidiscrete import Semidiscrete
 from jsmitsm.runtime.tracers import is_traced
 
 
@@ -30,6 +30,7 @@ class Pushing:
         self.semi, self.points = semi, np.asarray(semi.points)
         self.apart, self.slopes = semi.apart, semi.slopes
         self.lender = semi.disc.partner
+        self._last: tuple[Any, Any] | None = None
 
     def given(self) -> Push:
         semi = self.semi
@@ -56,7 +57,7 @@ class Pushing:
 
     def _kept(self, values: Any) -> Any:
         """The matrix with its form for the host kept from one call to the next."""
-        if getattr(self, "_last", None) is None or self._last[0] is not values:
+        if self._last is None or self._last[0] is not values:
             self._last = values, self.semi.source.with_values(values)
         return self._last[1]
 

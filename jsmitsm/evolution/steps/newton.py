@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from jsmitsm.evolution.matrices import Sparse
-from jsmitsm.evolution.semidiscrete import Semidiscrete
-from jsmitsm.evolution.stepping import Stopped
+from jsmitsm.evolution.space.matrices import Sparse, combined
+from jsmitsm.evolution.space.semidiscrete import Semidiscrete
+from jsmitsm.evolution.steps.stepping import Stopped
 from jsmitsm.linear.sparse import Factor
 from jsmitsm.runtime.errors import SolveError
 
@@ -57,10 +57,8 @@ class Newton:
         semi = self.semi
         system = semi.system
         extra = (g * semi.linearised(semi.steepness(semi.placed(y, known), t))).tocoo()
-        parts = [(1.0, system.masses[0]), (g, system.stiffness),
-                 (1.0, Sparse(extra.data, *extra.coords, extra.shape))]  # fmt: skip
-        values = np.concatenate([f * np.asarray(m.values) for f, m in parts])
-        rows, cols = (np.concatenate([getattr(m, name) for _, m in parts]) for name in ("rows", "cols"))
+        more = Sparse(extra.data, extra.coords[0], extra.coords[1], extra.shape)
+        values, rows, cols = combined([(1.0, system.masses[0]), (g, system.stiffness), (1.0, more)])
         try:
             self._factor = Factor(values, rows, cols, system.n, system.points, "sparse", False, 0)
         except SolveError as fault:

@@ -21,13 +21,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jsmitsm.evolution.pushing import Pushing
-from jsmitsm.evolution.system import System
-from jsmitsm.evolution.tableaux import Additive
+from jsmitsm.evolution.gradient.pushing import Pushing
+from jsmitsm.evolution.space.matrices import sampled
+from jsmitsm.evolution.space.system import System
+from jsmitsm.evolution.steps.tableaux import Additive
 from jsmitsm.runtime.tracers import is_traced
 
 # Bytes of stages that are kept for the way back; beyond that they are made again step by step.
 TAPE = 2**30
+# Products of cotangents and states that are taken together.
+MANY = 100
 
 
 @dataclass(eq=False)
@@ -154,20 +157,21 @@ def _backward_rule(plan: Plan, kept: Any, out_bar: Any) -> tuple[Any]:
         return kept(out_bar)
     if is_traced(out_bar):  # several cotangents at once, as in jax.jacrev: one after the other
         return (_mapped(kept, out_bar),)
-    return (_backward(*kept.parts, np.asarray(out_bar)),)
+    return (_backward(kept, np.asarray(out_bar)),)
 
 
 def _mapped(kept: _Tape, out_bar: Any) -> Any:
     given = kept.parts[1]
     shapes = jax.tree.map(lambda v: jax.ShapeDtypeStruct(np.shape(v), np.asarray(v).dtype), given)
     return jax.pure_callback(
-        lambda bar: jax.tree.map(np.asarray, _backward(*kept.parts, np.asarray(bar))), shapes, out_bar,
+        lambda bar: jax.tree.map(np.asarray, _backward(kept, np.asarray(bar))), shapes, out_bar,
         vmap_method="sequential",
     )  # fmt: skip
 
 
-def _backward(plan: Plan, given: Inputs, out: Any, system: System, tape: list[Any], out_bar: np.ndarray) -> Inputs:
+def _backward(kept: _Tape, out_bar: np.ndarray) -> Inputs:
     """The cotangents of all inputs."""
+    plan, given, out, system, tape = kept.parts
     at = jax.tree.map(np.asarray, given)
     scheme, h = plan.scheme, float(at.h)
     s, g = scheme.stages - 1, scheme.gamma
@@ -179,9 +183,8 @@ def _backward(plan: Plan, given: Inputs, out: Any, system: System, tape: list[An
     for k in range(plan.steps - 1, -1, -1):
         ys, ps, qs = tape[k] if tape[k] is not None else _stages(plan, system, at, k, np.asarray(out[k]))
         first = k * s
-        p_bar = [0.0] * (s + 1)
-        q_bar = [0.0] * (s + 1)
-        start_bar, stage_bar = np.array(out_bar[k]), y_bar
+        p_bar, q_bar = (np.zeros((s, system.size)) for _ in range(2))
+        start_bar, stage_bar, slope = np.array(out_bar[k]), y_bar, np.zeros(system.size)
         for i in range(s, 0, -1):
             low = resolvent.solve_transposed(stage_bar)
             start_bar += system.mass_transposed(low)
@@ -192,21 +195,22 @@ def _backward(plan: Plan, given: Inputs, out: Any, system: System, tape: list[An
             for j in range(i):
                 a, e = scheme.implicit[i, j], scheme.explicit[i, j]
                 if a:
-                    p_bar[j] = p_bar[j] + (h * a) * low
+                    p_bar[j] += (h * a) * low
                     drift = drift + a * ps[j]
                 if pull is not None and e:
-                    q_bar[j] = q_bar[j] + (h * e) * low
+                    q_bar[j] += (h * e) * low
                     drift = drift + e * qs[j]
             h_bar += float(low @ drift)
-            gather.add(low, ys[0] - ys[i], (-g * h) * low, ys[i])
+            gather.mass(low, ys[0] - ys[i])
+            gather.stiff((-g * h) * low - slope, ys[i])
             # On to stage i - 1: what asked for its slope.
-            slope = np.where(plan.still, 0.0, p_bar[i - 1]) if np.ndim(p_bar[i - 1]) else np.zeros(system.size)
+            slope = np.where(plan.still, 0.0, p_bar[i - 1])
             number = first + i - 1
             force[number] += slope
-            gather.add(None, None, -slope, ys[i - 1])
             stage_bar = -system.stiff_transposed(slope)
-            if pull is not None and np.ndim(q_bar[i - 1]):
+            if pull is not None:
                 stage_bar = stage_bar + pull(q_bar[i - 1], ys[i - 1], number)
+        gather.stiff(-slope, ys[0])
         y_bar = start_bar + stage_bar
     push_bar, known_bar, times_bar = (
         (jax.tree.map(np.zeros_like, at.push), np.zeros(at.known.shape), np.zeros(at.times.shape))
@@ -216,46 +220,42 @@ def _backward(plan: Plan, given: Inputs, out: Any, system: System, tape: list[An
 
 
 class _Gather:
-    """Collects the cotangents of the matrices at their entries."""
+    """Collects the cotangents of the matrices at their entries, many products at a time."""
 
     def __init__(self, system: System):
-        self.system = system
+        self.system, self.lower = system, slice(system.n if system.second else 0, None)
         self.bars = [np.zeros(np.shape(v)) for v in system.values]
-        self._mass: list[tuple[Any, Any]] = []
-        self._stiff: list[tuple[Any, Any]] = []
+        self._mass: list[tuple[np.ndarray, np.ndarray]] = []
+        self._stiff: list[tuple[np.ndarray, np.ndarray]] = []
 
-    def add(self, mass_left: Any, mass_right: Any, left: Any, right: Any) -> None:
-        """E* += mass_left mass_right^T and A* += left right^T."""
-        if mass_left is not None:
-            self._mass.append((mass_left, mass_right))
-        self._stiff.append((left, right))
-        if len(self._stiff) >= 16:
+    def mass(self, left: np.ndarray, right: np.ndarray) -> None:
+        """E* += left right^T; the upper half of E, where there is one, is not differentiated."""
+        self._mass.append((left[self.lower], right[self.lower]))
+        if len(self._mass) == MANY:
             self._flush()
+
+    def stiff(self, left: np.ndarray, right: np.ndarray) -> None:
+        """A* += left right^T."""
+        self._stiff.append((left[self.lower], right))
 
     def _flush(self) -> None:
         system, n = self.system, self.system.n
-        if not self._stiff:
-            return
-        left, right = (np.stack(v) for v in zip(*self._stiff))
-        mass_left, mass_right = (np.stack(v) for v in zip(*self._mass)) if self._mass else (None, None)
-        if not system.second:
-            self._at(0, system.stiffness, left, right)
-            if mass_left is not None:
-                self._at(1, system.masses[0], mass_left, mass_right)
-        else:  # A = [0, -1; A, M1], E = [1, 0; 0, M2]
-            self._at(0, system.stiffness, left[:, n:], right[:, :n])
-            self._at(1, system.masses[0], left[:, n:], right[:, n:])
-            if mass_left is not None:
-                self._at(2, system.masses[1], mass_left[:, n:], mass_right[:, n:])
+        if self._mass:
+            self.bars[-1] += sampled(system.masses[-1], *_columns(self._mass))
+        if self._stiff:
+            left, right = _columns(self._stiff)
+            self.bars[0] += sampled(system.stiffness, left, right[:n])
+            if system.second:  # A = [0, -1; A, M1]
+                self.bars[1] += sampled(system.masses[0], left, right[n:])
         self._mass, self._stiff = [], []
-
-    def _at(self, which: int, matrix: Any, left: np.ndarray, right: np.ndarray) -> None:
-        a, b = np.ascontiguousarray(left.T), np.ascontiguousarray(right.T)
-        self.bars[which] += np.einsum("ej,ej->e", a[matrix.rows], b[matrix.cols])
 
     def values(self) -> tuple[np.ndarray, ...]:
         self._flush()
         return tuple(self.bars)
+
+
+def _columns(pairs: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, ...]:
+    return tuple(np.ascontiguousarray(np.stack(v).T) for v in zip(*pairs))
 
 
 states.defvjp(_forward_rule, _backward_rule)

@@ -9,7 +9,7 @@ import numpy as np
 
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.cloud.neighbours import nearest
-from jsmitsm.evolution.matrices import Sparse
+from jsmitsm.evolution.space.matrices import Sparse
 from jsmitsm.taylor.multi_indices import MultiIndex, count, factorial, index_of, multi_indices
 
 # Particles fitted at a time.

@@ -1,0 +1,1 @@
+"""Steps in time: schemes as data, their stages, their control, what lies between them."""

@@ -1,0 +1,399 @@
+"""Evolutions by their public name: exact on polynomials, every kind of condition, systems, waves, failures."""
+
+import pickle
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jsmitsm as js
+
+ROD = js.interval(0.0, 1.0, 17)
+SQUARE = js.rectangle((0.0, 0.0), (1.0, 1.0), (9, 9), jitter=0.2)
+CUBE = js.box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (5, 5, 5), jitter=0.1)
+SIDES = ("left", "right", "bottom", "top", "front", "back")
+
+
+def at(f, cloud, *more):
+    return np.asarray(jax.vmap(lambda x: f(x, *more))(cloud.points))
+
+
+def everywhere(cloud, condition):
+    return {name: condition for name in SIDES if name in cloud.groups}
+
+
+def heat(exact, rate=1.0):
+    """u_t = rate lap u + s with this answer."""
+    source = lambda x, t: jax.grad(exact, 1)(x, t) - rate * js.laplacian(lambda y: exact(y, t))(x)  # noqa: E731
+    return lambda u, x, t: js.dt(u)(x) - rate * js.laplacian(u)(x) - source(x, t)
+
+
+def smooth(x, t):
+    return jnp.sin(x[0] + 2.0 * t) + (jnp.cos(x[1] - t) if len(x) > 1 else 0.0)
+
+
+def polynomial(x, t):
+    """Of degree 4 in x and 2 in t, which every stage of KenCarp4 and Radau IIA has exactly."""
+    return (1.0 + t + t**2) * (x[0] ** 4 - x[0] * x[-1] + x[-1] ** 3)
+
+
+@pytest.mark.parametrize("cloud", [ROD, SQUARE, CUBE], ids=["1D", "2D", "3D"])
+@pytest.mark.parametrize("scheme", ["esdirk", "radau"])
+def test_exact_on_polynomials(cloud, scheme):
+    problem = js.Problem(heat(polynomial), everywhere(cloud, js.dirichlet(polynomial)))
+    run = js.evolve(problem, cloud, lambda x: polynomial(x, 0.0), t=(0.0, 1.0), steps=4, scheme=scheme, save=2)
+    assert run.converged and not run.flags and run.t.tolist() == [0.0, 0.5, 1.0]
+    for t, u in zip(run.t, run.u):
+        assert np.abs(u - at(polynomial, cloud, t)).max() < 1e-11  # round-off of some 20 solves
+
+
+@pytest.mark.parametrize("condition", [
+    js.neumann(lambda x, t: jnp.where(x[0] < 0.5, -1.0, 1.0) * jax.grad(polynomial)(x, t)[0]),
+    js.robin(2.0, 1.0, lambda x, t: 2 * polynomial(x, t) + jnp.where(x[0] < 0.5, -1.0, 1.0)
+             * jax.grad(polynomial)(x, t)[0]),
+    js.condition(lambda u, x, n, t: u(x) + n @ js.grad(u)(x) - polynomial(x, t) - n @ jax.grad(polynomial)(x, t)),
+    js.condition(lambda u, x, t: u(x) - polynomial(x, t)),
+])  # fmt: skip
+def test_every_kind_of_condition(condition):
+    problem = js.Problem(heat(polynomial), {"left": condition, "right": js.dirichlet(polynomial)})
+    run = js.evolve(problem, ROD, lambda x: polynomial(x, 0.0), t=(0.0, 1.0), steps=5)
+    assert np.abs(run.u[-1] - at(polynomial, ROD, 1.0)).max() < 1e-11
+
+
+def test_pure_neumann_needs_no_value():
+    """The resolvent of the pencil is regular though the operator is not; the mean of u grows by the source, 2."""
+    problem = js.Problem(lambda u, x, t: js.dt(u)(x) - js.laplacian(u)(x) - 2.0, {"left": js.neumann(0.0),
+                                                                                 "right": js.neumann(0.0)})  # fmt: skip
+    run = js.evolve(problem, ROD, 1.0, t=(0.0, 3.0), steps=10)
+    assert np.abs(run.u[-1] - 7.0).max() < 1e-11
+
+
+def test_orders_in_time_and_space():
+    """In time at fixed particles of order 6, and in space with many steps: order p - 0.3 at least."""
+    problem = js.Problem(heat(smooth), everywhere(SQUARE, js.dirichlet(smooth)))
+
+    def error(cloud, order, steps, scheme):
+        start = lambda x: smooth(x, 0.0)  # noqa: E731
+        run = js.evolve(problem, cloud, start, t=(0.0, 1.0), steps=steps, order=order, scheme=scheme)
+        return np.abs(run.u[-1] - at(smooth, cloud, 1.0)).max()
+
+    assert np.log2(error(SQUARE, 8, 3, "esdirk") / error(SQUARE, 8, 6, "esdirk")) > 3.3
+    fine = js.rectangle((0.0, 0.0), (1.0, 1.0), (17, 17), jitter=0.2)
+    coarse, half = error(SQUARE, 4, 40, "radau"), error(fine, 4, 40, "radau")
+    assert half < 3e-7 and np.log2(coarse / half) > 3.7
+
+
+def test_small_steps_do_no_harm_on_a_random_cloud():
+    """An unstable pencil hides behind large steps of an L-stable scheme: 10 and 400 steps have one error."""
+    points = np.array(SQUARE.points)
+    inner = np.asarray(SQUARE.groups["interior"])
+    points[inner] = np.random.default_rng(3).uniform(0.03, 0.97, (len(inner), 2))
+    cloud = js.Cloud(points, SQUARE.groups, SQUARE.normals)
+    problem = js.Problem(heat(smooth), everywhere(cloud, js.dirichlet(smooth)))
+    errors = []
+    for steps in (10, 400):
+        run = js.evolve(problem, cloud, lambda x: smooth(x, 0.0), t=(0.0, 1.0), steps=steps, scheme="esdirk")
+        errors.append(np.abs(run.u[-1] - at(smooth, cloud, 1.0)).max())
+    assert errors[0] < 1e-3 and errors[1] < 1.2 * errors[0]
+
+
+def test_a_start_that_contradicts_the_conditions_is_an_impulse():
+    """u = 1 between ends that are held at 0, against its Fourier series."""
+    cloud = js.interval(0.0, 1.0, 41)
+    problem = js.Problem(lambda u, x, t: js.dt(u)(x) - js.laplacian(u)(x), everywhere(cloud, js.dirichlet(0.0)))
+    run = js.evolve(problem, cloud, 1.0, t=(0.0, 0.1), steps=40, order=6)
+    k = np.arange(1, 60, 2) * np.pi
+    x = np.asarray(cloud.points)
+    exact = (4 / k * np.sin(k * x) * np.exp(-(k**2) * 0.1)).sum(axis=1)
+    assert np.abs(run.u[-1] - exact).max() < 1e-6
+
+
+# ------------------------------------------------------------------ nonlinear problems
+
+
+def front(x, t):
+    """u_t = u_xx / 16 + u (1 - u) (u - 0.3) has this travelling wave."""
+    return 1.0 / (1.0 + jnp.exp((4.0 * x[0] - jnp.sqrt(2.0) * 0.2 * t) / jnp.sqrt(2.0)))
+
+
+@pytest.mark.parametrize(("scheme", "most"), [("imex", 1e-6), ("esdirk", 1e-7)])
+def test_a_travelling_front(scheme, most):
+    cloud = js.interval(0.0, 1.0, 31)
+    problem = js.Problem(
+        lambda u, x, t: js.dt(u)(x) - js.laplacian(u)(x) / 16 - u(x) * (1 - u(x)) * (u(x) - 0.3),
+        everywhere(cloud, js.dirichlet(front)),
+    )
+    run = js.evolve(problem, cloud, lambda x: front(x, 0.0), t=(0.0, 2.0), steps=40, order=6, scheme=scheme)
+    assert np.abs(run.u[-1] - at(front, cloud, 2.0)).max() < most and not run.flags
+
+
+def test_burgers():
+    exact = lambda x, t: 1.0 / (1.0 + jnp.exp((x[0] - 0.5 * t) / 0.2))  # noqa: E731
+    problem = js.Problem(
+        lambda u, x, t: js.dt(u)(x) + u(x) * js.grad(u)(x)[0] - 0.1 * js.laplacian(u)(x), everywhere(ROD,
+        js.dirichlet(exact)),
+    )  # fmt: skip
+    run = js.evolve(problem, ROD, lambda x: exact(x, 0.0), t=(0.0, 0.5), steps=40, order=6)
+    assert np.abs(run.u[-1] - at(exact, ROD, 0.5)).max() < 1e-4 and run.stats["scheme"].startswith("KenCarp4, imp")
+
+
+@pytest.mark.parametrize("flux", [
+    lambda u, x, t: (1 + u(x)) * js.grad(u)(x), lambda u, x, t: (1 + 0.5 * jnp.sin(3 * t)) * js.grad(u)(x),
+], ids=["quasilinear", "in time"])  # fmt: skip
+def test_operators_that_change(flux):
+    """Newton's method on a pencil that is made anew where the coefficients have moved."""
+    exact = lambda x, t: 1.0 + 0.5 * jnp.sin(x[0] + t)  # noqa: E731
+
+    def residual(u, rate, x, t):
+        return rate - js.divergence(lambda y: flux(u, y, t))(x)
+
+    def pde(u, x, t):
+        known = lambda y: exact(y, t)  # noqa: E731
+        return residual(u, js.dt(u)(x), x, t) - residual(known, jax.grad(exact, 1)(x, t), x, t)
+
+    problem = js.Problem(pde, everywhere(ROD, js.dirichlet(exact)))
+    run = js.evolve(problem, ROD, lambda x: exact(x, 0.0), t=(0.0, 1.0), steps=10, order=6)
+    assert np.abs(run.u[-1] - at(exact, ROD, 1.0)).max() < 1e-6 and run.stats["pencils"] > 1
+
+
+# ------------------------------------------------------------------ systems, waves
+
+
+def test_two_fields_whose_rates_mix():
+    """2 u_t + v_t = lap u + ..., v_t = lap v + u + ...: the mass is a matrix."""
+    # The source lap u + ... has the degree of its fits, 2.
+    exact = lambda x, t: jnp.stack([(1 + t**2) * x[0] ** 2, polynomial(x, t)])  # noqa: E731
+
+    def residual(rate, lap, u):
+        return jnp.stack([2 * rate[0] + rate[1] - lap[0], rate[1] - lap[1] - u[0]])
+
+    def pde(u, x, t):
+        known = residual(jax.jacfwd(exact, 1)(x, t), js.laplacian(lambda y: exact(y, t))(x), exact(x, t))
+        return residual(js.dt(u)(x), js.laplacian(u)(x), u(x)) - known
+
+    problem = js.Problem(pde, everywhere(ROD, js.dirichlet(exact)), fields=2)
+    run = js.evolve(problem, ROD, lambda x: exact(x, 0.0), t=(0.0, 1.0), steps=5)
+    assert run.u.shape == (2, 17, 2) and np.abs(run.u[-1] - at(exact, ROD, 1.0)).max() < 1e-10
+
+
+@pytest.mark.parametrize("scheme", ["radau", "esdirk"])
+def test_an_equation_without_a_rate(scheme):
+    """v follows u at every moment, from a start that knows nothing of it."""
+    exact = lambda x, t: jnp.stack([jnp.sin(x[0] + t), jnp.cos(x[0] - t)])  # noqa: E731
+
+    def residual(rate, lap, u):
+        return jnp.stack([rate - lap[0] + u[1], -lap[1] - u[0]])
+
+    def pde(u, x, t):
+        known = residual(jax.jacfwd(exact, 1)(x, t)[0], js.laplacian(lambda y: exact(y, t))(x), exact(x, t))
+        return residual(js.dt(u[0])(x), js.laplacian(u)(x), u(x)) - known
+
+    problem = js.Problem(pde, everywhere(ROD, js.dirichlet(exact)), fields=2)
+    start = lambda x: jnp.stack([jnp.sin(x[0]), 0.0])  # noqa: E731
+    run = js.evolve(problem, ROD, start, t=(0.0, 1.0), steps=20, order=6, scheme=scheme)
+    assert np.abs(run.u[-1] - at(exact, ROD, 1.0)).max() < 1e-7
+
+
+def test_a_wave_over_ten_periods():
+    wave = lambda x, t: jnp.sin(jnp.pi * x[0]) * jnp.cos(jnp.pi * t)  # noqa: E731
+    problem = js.Problem(lambda u, x, t: js.dt(u, 2)(x) - js.laplacian(u)(x), everywhere(ROD, js.dirichlet(0.0)))
+    run = js.evolve(problem, ROD, (lambda x: wave(x, 0.0), 0.0), t=(0.0, 20.0), steps=400, order=6)
+    assert run.stats["damping"] > 0 and np.abs(run.u[-1] - at(wave, ROD, 20.0)).max() < 3e-4
+    assert np.abs(run.rate[-1]).max() < 1e-3
+
+
+def test_a_wave_that_its_ends_drive():
+    wave = lambda x, t: jnp.sin(x[0] - t)  # noqa: E731
+    problem = js.Problem(lambda u, x, t: js.dt(u, 2)(x) - js.laplacian(u)(x), everywhere(ROD, js.dirichlet(wave)))
+    start = (lambda x: wave(x, 0.0), lambda x: jax.grad(wave, 1)(x, 0.0))
+    run = js.evolve(problem, ROD, start, t=(0.0, 2.0), steps=40, order=6)
+    assert np.abs(run.u[-1] - at(wave, ROD, 2.0)).max() < 1e-7
+
+
+def test_periodic_pairs():
+    cloud = js.rectangle((0.0, 0.0), (1.0, 1.0), (13, 13), jitter=0.1)
+    k = 2 * jnp.pi
+    exact = lambda x, t: jnp.exp(-0.1 * k**2 * t) * jnp.sin(k * (x[0] - t))  # noqa: E731
+    problem = js.Problem(
+        lambda u, x, t: js.dt(u)(x) + js.grad(u)(x)[0] - 0.1 * js.laplacian(u)(x),
+        {"left": js.periodic("left", "right"), "bottom": js.periodic("bottom", "top")},
+    )
+    run = js.evolve(problem, cloud, lambda x: exact(x, 0.0), t=(0.0, 0.25), steps=20, order=6)
+    assert np.abs(run.u[-1] - at(exact, cloud, 0.25)).max() < 1e-3  # 12 particles a wave
+    assert np.array_equal(run.u[-1][cloud.groups["left"]], run.u[-1][cloud.groups["right"]])
+
+
+def test_schroedinger_is_damped_enough():
+    wave = lambda x, t: jnp.stack([jnp.cos(2 * x[0] - 2 * t), jnp.sin(2 * x[0] - 2 * t)])  # noqa: E731
+    problem = js.Problem(
+        lambda u, x, t: jnp.stack([js.dt(u[0])(x) + 0.5 * js.laplacian(u[1])(x),
+                                   js.dt(u[1])(x) - 0.5 * js.laplacian(u[0])(x)]),
+        everywhere(ROD, js.dirichlet(wave)), fields=2,
+    )  # fmt: skip
+    run = js.evolve(problem, ROD, lambda x: wave(x, 0.0), t=(0.0, 2.0), steps=100, order=6)
+    assert run.stats["damping"] > 0 and np.abs(run.u[-1] - at(wave, ROD, 2.0)).max() < 1e-4
+
+
+# ------------------------------------------------------------------ what is returned
+
+
+def moving_heat(**options):
+    problem = js.Problem(heat(smooth), everywhere(ROD, js.dirichlet(smooth)))
+    return js.evolve(problem, ROD, lambda x: smooth(x, 0.0), t=(0.0, 1.0), **{"order": 6, **options})
+
+
+def test_states_between_the_steps_are_solutions():
+    run = moving_heat(steps=20, save=[0.31, 0.5])
+    assert run.t.tolist() == [0.0, 0.31, 0.5, 1.0]
+    assert max(np.abs(u - at(smooth, ROD, t)).max() for t, u in zip(run.t, run.u)) < 1e-6
+    points = np.array([[0.123], [0.77]])
+    state = run.at(0.613)
+    for found, f in ((state(points), smooth), (state.grad(points)[:, 0], lambda x, t: jax.grad(smooth)(x, t)[0])):
+        assert np.abs(found - jax.vmap(lambda x: f(x, 0.613))(points)).max() < 1e-6
+    assert abs(state.integral() - (np.cos(2 * 0.613) - np.cos(1 + 2 * 0.613))) < 1e-6
+    with pytest.raises(ValueError, match="outside of the run, from 0 to 1"):
+        run.at(1.2)
+    with pytest.raises(ValueError, match="ask the evolution"):
+        state.error_estimate()
+
+
+def test_a_tolerance_is_kept_and_saved_times_are_met():
+    run = moving_heat(tol=1e-5, save=3)
+    assert 3 <= run.stats["steps"] < 60 and run.stats["factorisations"] <= 8
+    assert max(np.abs(u - at(smooth, ROD, t)).max() for t, u in zip(run.t, run.u)) < 3e-5
+
+
+def test_the_error_estimate_bounds_the_error_and_is_no_larger_than_it_must():
+    """In space at order 4, with steps that add nothing."""
+    run = moving_heat(steps=40, order=4)
+    error = np.abs(run.u[-1] - at(smooth, ROD, 1.0)).max()
+    found = run.error_estimate()
+    assert found.shape == run.u.shape and error / 3 < found[-1].max() < 100 * error + 1e-7
+
+
+def test_a_run_goes_on_where_it_was_left():
+    half = moving_heat(steps=20)
+    problem = js.Problem(heat(smooth), everywhere(ROD, js.dirichlet(smooth)))
+    again = js.evolve(problem, ROD, half.u[-1], t=(1.0, 2.0), steps=20, order=6)
+    assert np.abs(again.u[-1] - at(smooth, ROD, 2.0)).max() < 1e-6
+
+
+def test_a_run_pickles_and_goes_to_xarray():
+    run = moving_heat(steps=10, save=2)
+    copy = pickle.loads(pickle.dumps(run))
+    assert np.array_equal(copy.u, run.u) and abs(copy.at(0.3)([[0.4]])[0] - run.at(0.3)([[0.4]])[0]) < 1e-9
+    pytest.importorskip("xarray")
+    table = run.to_xarray()
+    assert table["u"].dims == ("time", "particle") and table["time"].values.tolist() == [0.0, 0.5, 1.0]
+
+
+# ------------------------------------------------------------------ gradients
+
+
+def hot(p):
+    return js.Problem(
+        lambda u, x, t, p: js.dt(u)(x) - p["k"] * js.laplacian(u)(x) - p["s"] * jnp.sin(x[0] + t),
+        everywhere(ROD, js.dirichlet(lambda x, t, p: p["b"] * jnp.cos(t))), params=p,
+    )  # fmt: skip
+
+
+def reacting(p):
+    return js.Problem(
+        lambda u, x, t, p: js.dt(u)(x) - p["k"] * js.laplacian(u)(x) + u(x) * js.grad(u)(x)[0] - p["s"] * u(x) ** 2,
+        everywhere(ROD, js.dirichlet(lambda x, t, p: p["b"] * jnp.cos(t))), params=p,
+    )  # fmt: skip
+
+
+def slope(f, p, way, eps=1e-4):
+    """Of fourth order in eps: the tolerance below is that of its round-off."""
+    moved = lambda s: f(jax.tree.map(lambda a, b: a + s * b, p, way))  # noqa: E731
+    return (8 * (moved(eps) - moved(-eps)) - moved(2 * eps) + moved(-2 * eps)) / (12 * eps)
+
+
+@pytest.mark.parametrize("made", [hot, reacting])
+def test_gradients_are_those_of_differences(made):
+    """By everything at once: the operator, the source, the conditions, the start and the end."""
+    def total(p):
+        start = lambda x: p["b"] + 0.1 * p["a"] * x[0]  # noqa: E731
+        run = js.evolve(made(p), ROD, start, t=(0.0, p["end"]), steps=8, save=2,
+                        scheme="esdirk" if made is hot else "auto")  # fmt: skip
+        return jnp.sum(run.u[-1] ** 2) + run.u[1, 5]
+
+    p = {"k": 0.3, "s": 0.7, "b": 0.5, "a": 0.4, "end": 0.6}
+    p = {name: jnp.asarray(v) for name, v in p.items()}
+    way = dict(zip(p, (0.3, -0.5, 0.8, 1.0, 0.6)))
+    value, found = jax.value_and_grad(total)(p)
+    assert abs(value - total(p)) < 1e-10
+    along = sum(found[name] * way[name] for name in p)
+    assert abs(along - slope(total, p, way)) < 1e-7 * abs(along)
+
+
+def test_jit_and_vmap():
+    def last(s):
+        p = {"k": 0.3, "s": s, "b": 0.5}
+        return jnp.sum(js.evolve(hot(p), ROD, 0.5, t=(0.0, 0.5), steps=4, scheme="esdirk").u[-1])
+
+    some = jnp.array([0.2, 0.4])
+    one = jnp.stack([last(k) for k in some])
+    assert np.abs(jax.vmap(last)(some) - one).max() < 1e-12
+    value, found = jax.jit(jax.value_and_grad(last))(some[0])
+    assert abs(value - one[0]) < 1e-12 and abs(found - jax.grad(last)(some[0])) < 1e-9 * abs(found)
+
+
+# ------------------------------------------------------------------ refusals and failures
+
+COOLING = js.Problem(lambda u, x, t: js.dt(u)(x) - js.laplacian(u)(x), everywhere(ROD, js.dirichlet(0.0)))
+
+
+def evolved(problem=COOLING, u0=1.0, t=(0.0, 1.0), **options):
+    return js.evolve(problem, ROD, u0, t, **(options or {"steps": 4}))
+
+
+@pytest.mark.parametrize(("call", "words"), [
+    (lambda: evolved(steps=3, tol=1e-3), "steps, tol: give exactly one"),
+    (lambda: evolved(order=4), "steps, tol: give exactly one"),
+    (lambda: evolved(steps=0), "steps: expected a whole number from 1"),
+    (lambda: evolved(steps=2.5), "steps: expected a whole number"),
+    (lambda: evolved(tol=-1.0), "tol: expected a number from"),
+    (lambda: evolved(steps=4, scheme="esdrik"), "did you mean 'esdirk'"),
+    (lambda: evolved(t=(1.0, 0.0)), "t0 < t1"),
+    (lambda: evolved(t=1.0), r"t: expected the start and the end"),
+    (lambda: evolved(u0=np.zeros(5)), "u0: expected a function of x or an array \\(17,\\)"),
+    (lambda: evolved(u0=np.nan), "u0: NaN or infinite"),
+    (lambda: evolved(steps=4, save=[2.0]), "save: times from 2 to 2"),
+    (lambda: evolved(steps=4, save=0), "save: expected at least 1"),
+    (lambda: evolved(steps=4, damping=-1), "damping: expected"),
+    (lambda: evolved(js.Problem(lambda u, x: js.laplacian(u)(x), COOLING.bcs)), r"pde: js.evolve calls it as f\(u, x, t"),
+    (lambda: evolved(js.Problem(lambda u, x, t: js.laplacian(u)(x), COOLING.bcs)), "no rate in it"),
+    (lambda: evolved(js.Problem(lambda u, x, t: u(x) * js.dt(u)(x) - js.laplacian(u)(x), COOLING.bcs)), "divide the eq"),
+    (lambda: evolved(js.Problem(lambda u, x, t: js.dt(u, 2)(x) - js.laplacian(u)(x), COOLING.bcs)), "starts from a pair"),
+    (lambda: evolved(js.Problem(lambda u, x, t: js.dt(u)(x) + js.grad(u)(x)[0], {**COOLING.bcs, "right": js.free()})),
+     "unstable for pure advection"),
+    (lambda: evolved(js.Problem(lambda u, x, t: js.dt(u)(x) + js.grad(u)(x)[0] - 1e-3 * js.laplacian(u)(x), COOLING.bcs)),
+     "cell Peclet number"),
+    (lambda: evolved(js.Problem(COOLING.pde, {**COOLING.bcs, "right": js.condition(
+        lambda u, x, n, t: n @ js.grad(u)(x) + u(x) ** 4)})), "the condition is nonlinear in u"),
+    (lambda: evolved(js.Problem(lambda u, x, t: js.dt(u)(x) - js.laplacian(u)(x) + u(x) ** 2, COOLING.bcs), steps=4,
+                     scheme="radau"), "radau\" serves linear problems"),
+    (lambda: js.solve(js.Problem(lambda u, x: js.dt(u)(x) - js.laplacian(u)(x), COOLING.bcs), ROD), "js.evolve"),
+    (lambda: js.dt(lambda x: x[0]), "js.dt takes the unknown u itself"),
+])  # fmt: skip
+def test_refused_in_words(call, words):
+    with pytest.raises(ValueError, match=words):
+        call()
+
+
+def test_a_run_that_blows_up_keeps_its_last_good_state():
+    """u_t = u_xx + u^2 from a large start is infinite soon."""
+    bcs = everywhere(ROD, js.neumann(0.0))
+    problem = js.Problem(lambda u, x, t: js.dt(u)(x) - js.laplacian(u)(x) - u(x) ** 2, bcs)
+    with pytest.raises(js.SolveError, match="the run stopped: the solution"):
+        js.evolve(problem, ROD, 10.0, t=(0.0, 5.0), steps=100)
+    run = js.evolve(problem, ROD, 10.0, t=(0.0, 5.0), steps=100, throw=False)
+    assert not run.converged and run.flags[0].startswith("FAILED") and np.isfinite(run.u).all() and run.t[-1] < 5.0
+
+
+def test_too_few_steps_are_flagged():
+    problem = js.Problem(lambda u, x, t: js.dt(u)(x) - js.laplacian(u)(x) - 100 * jnp.sin(40 * t), COOLING.bcs)
+    assert any("error in time" in flag for flag in js.evolve(problem, ROD, 0.0, t=(0.0, 3.0), steps=8).flags)
