@@ -9,7 +9,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jsmitsm.equation.problem import Condition, Problem
+from jsmitsm.equation.bcs import Condition
+from jsmitsm.equation.problem import Problem
 from jsmitsm.equation.traced import Traced
 from jsmitsm.equation.tracing import trace
 from jsmitsm.runtime.errors import IN_FUNCTIONS, in_words
