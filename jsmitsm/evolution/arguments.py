@@ -10,6 +10,7 @@ import numpy as np
 
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.equation.problem import Problem
+from jsmitsm.equation.unknowns.extras import refuse_extras
 from jsmitsm.runtime.errors import did_you_mean, refuse_masked, short
 from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.taylor.multi_indices import HIGHEST
@@ -22,6 +23,7 @@ MOST_STEPS = 10_000_000
 
 def check(problem, cloud, t, steps, tol, order, scheme, throw, progress) -> None:
     """ValueError for what cannot be right, with the remedy."""
+    refuse_extras(problem)
     for value, kind, name in ((problem, Problem, "problem"), (cloud, Cloud, "cloud")):
         if not isinstance(value, kind):
             raise ValueError(f"{name}: expected a js.{kind.__name__}, got {type(value).__name__}")
