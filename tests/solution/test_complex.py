@@ -80,6 +80,16 @@ def test_a_nonlinear_complex_equation():
     assert sol.converged and abs(sol.u - jax.vmap(exact)(LINE.points)).max() < 1e-7
 
 
+def test_a_jump_that_is_differentiated_is_refused_and_a_meant_one_is_not():
+    layers = lambda y: jnp.where(y[0] < 0.503, 1.0j, 100.0j)
+    conduct = lambda k: lambda u, x: js.divergence(lambda y: k(y) * js.grad(u)(y))(x)
+    ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(1.0j)}
+    with pytest.raises(ValueError, match="js.meant"):
+        js.solve(js.Problem(conduct(layers), ends, dtype=complex), LINE)
+    sol = js.solve(js.Problem(conduct(js.meant(layers)), ends, dtype=complex), LINE)
+    assert abs(sol.u - 1j * LINE.points[:, 0]).max() < 1e-12
+
+
 @pytest.mark.parametrize(
     "function",
     [

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import nullcontext
 from typing import Any, NamedTuple
 
 import jax
@@ -44,7 +45,10 @@ def _evaluate(jaxpr: Any, consts: Any, args: Any) -> list[Any]:
     known.update(zip(jaxpr.invars, args, strict=True))
     for eqn in jaxpr.eqns:
         vals = [read(v) for v in eqn.invars]
-        out = _done(eqn, vals)
+        # The scopes say what an operator differentiates and which jumps are meant.
+        scope = str(eqn.source_info.name_stack)
+        with jax.named_scope(scope) if scope else nullcontext():
+            out = _done(eqn, vals)
         known.update(zip(eqn.outvars, out if eqn.primitive.multiple_results else [out], strict=True))
     return [read(v) for v in jaxpr.outvars]
 
