@@ -7,12 +7,14 @@ from typing import TYPE_CHECKING, Any
 if sys.version_info < (3, 11):  # noqa: UP036  # of a copy that pip did not put there
     raise ImportError(f"jsmitsm needs Python 3.11 or newer, this is {sys.version.split()[0]}: take another interpreter")
 
-from jsmitsm.cloud.cloud import Cloud, box, rectangle
-from jsmitsm.cloud.line.interval import interval
+from jsmitsm.cloud.cloud import Cloud
+from jsmitsm.cloud.lattices.boxes import box, rectangle
+from jsmitsm.cloud.lattices.interval import interval
 from jsmitsm.cloud.neighbours import Stencils, stencils
+from jsmitsm.equation.bcs import Condition, condition, dirichlet, fix, free, neumann, periodic, robin
 from jsmitsm.equation.marks import meant
 from jsmitsm.equation.operators import divergence, dt, grad, hessian, laplacian, partial
-from jsmitsm.equation.problem import Condition, Problem, condition, dirichlet, fix, free, neumann, periodic, robin
+from jsmitsm.equation.problem import Problem
 from jsmitsm.equation.regions.interface import interface
 from jsmitsm.equation.unknowns.constraint import constraint
 from jsmitsm.equation.unknowns.point_source import point_source

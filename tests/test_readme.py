@@ -70,7 +70,7 @@ def test_the_two_commands_are_there(mark, needed):
 def test_files_and_pictures_linked_exist():
     for page in (ROOT / "README.md", *(ROOT / "docs").glob("*.md")):
         for target in re.findall(r"\]\(([^)#:$\\]+\.\w+)(?:#[^)]*)?\)", page.read_text()):
-            source = re.sub(r"^notebooks/(\w+)\.md$", r"../notebooks/\1.ipynb", target)  # pages of the site are made of them
+            source = re.sub(r"^notebooks/(\w+)\.md$", r"../notebooks/\1.ipynb", target)  # of which the page is made
             assert (page.parent / source).exists(), f"{page.name} links to {target}"
 
 

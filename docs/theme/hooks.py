@@ -76,6 +76,7 @@ def on_page_content(content, page, config, files):
     """Formulas, links and wide tables, once the page is HTML."""
     content = MATH.sub(mathml, content)
     content = NAME.sub(linked, content)
+    content = re.sub(r"<td>(-?[\d.]+e[-+]\d+)</td>", r'<td class="number">\1</td>', content)
     return re.sub(r"<table>(.*?)</table>", r'<div class="wide"><table>\1</table></div>', content, flags=re.S)
 
 

@@ -127,8 +127,8 @@ def adapt(
 
     Solve, estimate, see which particles the error comes from, make a new cloud with the spacing that gives every
     particle the same share, and again, until the estimate is within the tolerance and a solve of another order agrees.
-    Before the first solve, and whenever the tolerance seems reached, source and coefficients are looked at between the
-    particles, so that a peak that no particle meets is found.
+    Before the first solve source and coefficients are looked at between the particles, so that a peak that no particle
+    meets is found; where the tolerance seems reached, the polynomials of neighbours must meet between them.
 
     Parameters
     ----------

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import jax
 import numpy as np
 
 from jsmitsm.runtime.arrays import Array, ArrayLike
-from jsmitsm.runtime.errors import refuse_masked, short, some
+from jsmitsm.runtime.errors import refuse_masked, some
 from jsmitsm.runtime.tracers import frozen, owned
 
 INTERIOR = "interior"
 # Coordinates beyond this, or all below its inverse, have powers that are no numbers.
 FAR = 1e100
-_SIDES = (("left", 0, 0), ("right", 0, 1), ("bottom", 1, 0), ("top", 1, 1), ("front", 2, 0), ("back", 2, 1))
 
 
 class Groups(Mapping[str, np.ndarray]):
@@ -333,114 +332,3 @@ def checked_normals(normals: Any, points: Any, groups: Groups) -> Any:
 
 def _describe_groups(groups: Any) -> str:
     return f"keys {list(groups)}" if isinstance(groups, Mapping) else type(groups).__name__
-
-
-def rectangle(
-    lo: Sequence[float], hi: Sequence[float], shape: Sequence[int], jitter: float = 0.0, seed: int = 0
-) -> Cloud:
-    """A lattice of particles on a rectangle; groups interior, left, right, bottom, top.
-
-    A corner belongs to the first group that claims it, in that order.
-
-    Parameters
-    ----------
-    lo, hi : sequence of float (2,)
-        The lower left and the upper right corner.
-    shape : sequence of int (2,)
-        Particles along x and y.
-    jitter : float
-        Interior particles move by up to that fraction of the spacing along each axis.
-    seed : int
-        Makes the jitter reproducible.
-
-    Returns
-    -------
-    Cloud
-        In 2D.
-
-    Raises
-    ------
-    ValueError
-        For an empty rectangle, fewer than two particles along an axis, or a jitter of half a spacing or more.
-
-    Examples
-    --------
-    >>> import jsmitsm as js
-    >>> len(js.rectangle((0, 0), (4, 9), (5, 10)))
-    50
-    """
-    return lattice(lo, hi, shape, jitter, seed, dim=2)
-
-
-def box(lo: Sequence[float], hi: Sequence[float], shape: Sequence[int], jitter: float = 0.0, seed: int = 0) -> Cloud:
-    """A lattice of particles on a box; groups as in ``js.rectangle``, then front (low z) and back (high z).
-
-    Parameters
-    ----------
-    lo, hi : sequence of float (3,)
-        Two opposite corners.
-    shape : sequence of int (3,)
-        Particles along x, y and z.
-    jitter : float
-        Interior particles move by up to that fraction of the spacing along each axis.
-    seed : int
-        Makes the jitter reproducible.
-
-    Returns
-    -------
-    Cloud
-        In 3D.
-
-    Raises
-    ------
-    ValueError
-        As ``js.rectangle``.
-
-    Examples
-    --------
-    >>> import jsmitsm as js
-    >>> sorted(js.box((0, 0, 0), (1, 1, 1), (3, 3, 3)).groups)
-    ['back', 'bottom', 'front', 'interior', 'left', 'right', 'top']
-    """
-    return lattice(lo, hi, shape, jitter, seed, dim=3)
-
-
-def lattice(lo, hi, shape, jitter, seed, dim=1, names=("lo", "hi", "shape")) -> Cloud:
-    """A lattice cloud of any dimension; ``names``: of the arguments in what is raised."""
-    lo, hi = (_checked_corner(v, name, dim) for v, name in zip((lo, hi), names))
-    if not (hi > lo).all():
-        raise ValueError(f"{names[1]}: {hi.tolist()} must be greater than {names[0]} = {lo.tolist()} along every axis")
-    counts = np.atleast_1d(np.asarray(shape))
-    if counts.shape != (dim,) or counts.dtype.kind not in "iu" or (counts < 2).any():
-        raise ValueError(f"{names[2]}: expected {dim} whole number(s) of at least 2, got {shape!r}")
-    if not isinstance(jitter, (int, float, np.number)) or not 0.0 <= jitter < 0.5:
-        raise ValueError(f"jitter: expected 0 <= jitter < 0.5 spacings (beyond, particles may meet), got {jitter!r}")
-    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
-        raise ValueError(f"seed: expected a whole number from 0, the start of the random numbers, got {seed!r}")
-    axes = [np.linspace(a, b, n) for a, b, n in zip(lo, hi, counts)]
-    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, dim)
-    place = np.stack(np.meshgrid(*[np.arange(n) for n in counts], indexing="ij"), axis=-1).reshape(-1, dim)
-    free = np.ones(len(points), bool)
-    normals = np.full(points.shape, np.nan)
-    sides: dict[str, np.ndarray] = {}
-    for name, axis, end in _SIDES[: 2 * dim]:
-        claimed = free & (place[:, axis] == (counts[axis] - 1 if end else 0))
-        sides[name] = np.flatnonzero(claimed)
-        normals[claimed] = 0.0
-        normals[claimed, axis] = 1.0 if end else -1.0
-        free &= ~claimed
-    inside = np.flatnonzero(free)
-    if jitter:
-        spacing = (hi - lo) / (counts - 1)
-        points[inside] += jitter * spacing * np.random.default_rng(seed).uniform(-1, 1, (len(inside), dim))
-    return Cloud(points, {INTERIOR: inside, **sides}, normals)
-
-
-def _checked_corner(value: Any, name: str, dim: int) -> np.ndarray:
-    try:
-        corner = np.atleast_1d(np.asarray(value, dtype=np.float64))
-    except (TypeError, ValueError, OverflowError):
-        raise ValueError(f"{name}: expected {dim} finite number(s), got {short(value)}") from None
-    if corner.shape != (dim,) or not np.isfinite(corner).all():
-        raise ValueError(f"{name}: expected {dim} finite number(s), got {short(value)}")
-    return corner

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from jsmitsm.cloud import filling, levelset
-from jsmitsm.cloud.line.path import followed
+from jsmitsm.cloud.lattices.path import followed
 from jsmitsm.cloud.packing import relaxation
 from jsmitsm.cloud.packing.octree import Spacing
 

@@ -9,7 +9,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jsmitsm.equation.problem import Condition, Problem
+from jsmitsm.equation.bcs import Condition
+from jsmitsm.equation.problem import Problem
 from jsmitsm.equation.traced import Traced
 from jsmitsm.equation.tracing import trace
 from jsmitsm.runtime.errors import IN_FUNCTIONS, in_words
@@ -93,7 +94,9 @@ def _named(where: str, expected: str) -> Iterator[None]:
 
 def _shaped(result: Any, components: int, where: str) -> Any:
     if jnp.iscomplexobj(result):
-        raise ValueError(f"{where}: expected real numbers, got complex ones; take jnp.real of them, or js.Problem(..., dtype=complex)")
+        raise ValueError(
+            f"{where}: expected real numbers, got complex ones; take jnp.real of them, or js.Problem(..., dtype=complex)"
+        )
     result = jnp.asarray(result, float)
     if result.size == components and result.ndim <= 1:
         return result.reshape((components,) if components > 1 else ())

@@ -12,8 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm.cloud.cloud import INTERIOR, Cloud
+from jsmitsm.equation.bcs import Condition
 from jsmitsm.equation.closing import recorded_residual, recorded_values
-from jsmitsm.equation.problem import Condition, Problem
+from jsmitsm.equation.problem import Problem
 from jsmitsm.equation.traced import Traced
 from jsmitsm.runtime.errors import did_you_mean
 from jsmitsm.runtime.tracers import is_traced

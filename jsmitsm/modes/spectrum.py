@@ -72,7 +72,7 @@ class Pairs(NamedTuple):
 
 def pairs(pattern: Pattern, a: np.ndarray, c: np.ndarray, near: float, count: int, whole: bool) -> Pairs:
     """``count`` values and vectors; ``whole``: and the rest of the last cluster."""
-    op = _inverted(pattern, a, c, near)
+    op = _Inverse(pattern, a, c, near)
     values, right = op.largest(min(count + _MORE, op.most), transpose=False)
     values, right = _ascending(values, right, near)
     k = _cut(pattern, values, near, min(count, len(values)), whole)
@@ -88,7 +88,7 @@ def pairs(pattern: Pattern, a: np.ndarray, c: np.ndarray, near: float, count: in
     return Pairs(values, right, left, cluster, mean)
 
 
-class _inverted:
+class _Inverse:
     """(A - s C)^-1 C with a shift s near the number asked for, as a matrix or by its factor."""
 
     def __init__(self, pattern: Pattern, a: np.ndarray, c: np.ndarray, near: float):

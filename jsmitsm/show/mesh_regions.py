@@ -17,7 +17,7 @@ _KINDS = {1: "vertex", 2: "line", 3: "triangle", 4: "quad"}
 
 
 def regions_of(mesh: Any, key: str | None, names: list[str] | None) -> RegionCloud:
-    """The regions ``names`` of a mesh, or all tags of its cells; see :func:`jsmitsm.files.from_mesh`."""
+    """The regions ``names`` of a mesh, or all tags of its cells; see ``js.files.from_mesh``."""
     dim, _ = volume_cells(mesh.cells)
     tags = [tag for tag in chosen(all_tags(mesh, key), names) if tag.dim == dim]
     if not tags:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, Protocol
 
 import jax
@@ -10,12 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm.cloud.cloud import Cloud
-from jsmitsm.cloud.quadrature import quadrature
-from jsmitsm.runtime.arrays import Array, ArrayLike, ValueOrFunction
+from jsmitsm.runtime.arrays import Array
 from jsmitsm.runtime.errors import SolveError
 from jsmitsm.runtime.tracers import frozen, is_traced, owned
+from jsmitsm.solution.anywhere import Anywhere
 from jsmitsm.solution.estimate import Correction, correction
-from jsmitsm.solution.evaluation import checked_points, evaluated, in_domain, nearest_particles
 from jsmitsm.solution.fit import Recipe
 from jsmitsm.solution.flags import share
 
@@ -32,7 +31,7 @@ class Report(Protocol):
 
 
 @jax.tree_util.register_pytree_node_class
-class Solution:
+class Solution(Anywhere):
     """A solution at the particles, and anywhere through local Taylor polynomials.
 
 
@@ -62,11 +61,11 @@ class Solution:
     >>> # The answer is x^3.
     >>> sol = js.solve(js.Problem(lambda u, x: js.laplacian(u)(x) - 6 * x[0], ends), js.interval(0.0, 1.0, 9))
     >>> sol
-    Solution(u: 9, method='S', order=4, converged=True)
+    Solution(u: 9, method='S', order=4, depth=4, converged=True)
     >>> [round(float(value[0]), 9) for value in (sol([[0.3]]), sol.grad([[0.3]])[0], sol.derivative([[0.3]], (2,)))]
     [0.027, 0.27, 1.8]
     >>> round(float(sol.flux("right")), 9), sol.coefficients.shape, bool(sol.error_estimate().max() < 1e-12), sol.flags
-    (3.0, (9, 5), True, [])
+    (3.0, (9, 9), True, [])
     """
 
     def __init__(self, values, cloud, recipe, fit, converged, iterations, stats, fitted=None, report=None):
@@ -90,11 +89,6 @@ class Solution:
         return self._recipe.method
 
     @property
-    def order(self) -> int:
-        """The degree of the local fits."""
-        return self._recipe.order
-
-    @property
     def depth(self) -> int:
         """Degrees by which the local Taylor polynomials exceed the order."""
         return self._recipe.depth
@@ -109,16 +103,6 @@ class Solution:
         """Values (N,) at the particles, in the cloud's order; (N, F) for a system."""
         return self._values[..., 0] if self._recipe.fields == 1 else self._values
 
-    def refuse_stacked(self) -> None:
-        """Several solutions that came out of jax.vmap as one have values, and nothing else in common."""
-        stack = jnp.shape(self._values)[:-2]
-        if stack:
-            raise ValueError(
-                f"this Solution is a stack of {'x'.join(map(str, stack))} that came out of jax.vmap, of which only u "
-                "and converged can be read: ask inside the mapped function, or take one, "
-                "jax.tree.map(lambda x: x[0], sol)"
-            )
-
     @property
     def unknowns(self) -> dict[str, Any]:
         """The global unknowns that were found with u, by their names; none for a problem without them."""
@@ -129,215 +113,6 @@ class Solution:
         """Taylor coefficients d^a u / a!, (N, K), ordered as ``js.multi_indices``; (N, K, F) for a system."""
         fitted = self._taylor
         return fitted[:, 0] if self._recipe.fields == 1 else jnp.swapaxes(fitted, 1, 2)
-
-    @property
-    def _taylor(self) -> Any:
-        """Taylor coefficients (N, F, K)."""
-        self.refuse_stacked()
-        if self._fitted is None:
-            fitted = self._fit.coefficients(self._values)
-            if is_traced(fitted):
-                return fitted
-            self._fitted = frozen(fitted)
-        return self._fitted
-
-    def __call__(self, points: ArrayLike, *, blend: bool = False, outside: str = "nan") -> jax.Array:
-        """Values anywhere, from the local Taylor polynomials.
-
-        Each point takes the polynomial of its nearest particle, or with ``blend`` a smooth average
-        of those of its nearest few, which is continuous across the cloud.
-
-        Parameters
-        ----------
-        points : array_like (M, D)
-            Where.
-        blend : bool
-            Average the polynomials of the nearest few particles.
-        outside : {"nan", "raise", "extrapolate"}
-            What becomes of points outside of the domain and in its holes: NaN, a ValueError, or the polynomial of
-            the particle nearest to them. Points up to half the local spacing outside count as inside. The particles
-            tell what is inside; where all of a cloud's points are traced by jax.jit or jax.vmap nothing is known of
-            them, and everything counts as inside.
-
-        Returns
-        -------
-        jax.Array
-            (M,), for a system (M, F).
-
-        Raises
-        ------
-        ValueError
-            For points of another shape, NaN or infinite ones.
-
-        Examples
-        --------
-        >>> import jax; jax.config.update("jax_enable_x64", True)
-        >>> import jsmitsm as js
-        >>> ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(1.0)}
-        >>> problem = js.Problem(lambda u, x: js.laplacian(u)(x) - 6 * x[0], ends)  # x^3
-        >>> sol = js.solve(problem, js.interval(0.0, 1.0, 9))
-        >>> round(float(sol([[0.5]])[0]), 9)
-        0.125
-        """
-        return self.derivative(points, (0,) * self.cloud.dim, blend=blend, outside=outside)
-
-    def grad(self, points: ArrayLike, *, blend: bool = False, outside: str = "nan") -> jax.Array:
-        """Gradients anywhere.
-
-        Parameters
-        ----------
-        points : array_like (M, D)
-            Where.
-        blend : bool
-            Average the polynomials of the nearest few particles, as for values.
-        outside : {"nan", "raise", "extrapolate"}
-            What becomes of points outside of the domain, as for values.
-
-        Returns
-        -------
-        jax.Array
-            (M, D), for a system (M, F, D).
-
-        Raises
-        ------
-        ValueError
-            For points of another shape, NaN or infinite ones.
-
-        Examples
-        --------
-        >>> import jax; jax.config.update("jax_enable_x64", True)
-        >>> import jsmitsm as js
-        >>> ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(1.0)}
-        >>> problem = js.Problem(lambda u, x: js.laplacian(u)(x) - 6 * x[0], ends)  # x^3
-        >>> sol = js.solve(problem, js.interval(0.0, 1.0, 9))
-        >>> round(float(sol.grad([[0.5]])[0, 0]), 9)
-        0.75
-        """
-        unit = [tuple(map(int, b)) for b in np.eye(self.cloud.dim, dtype=int)]
-        return jnp.stack([self.derivative(points, b, blend=blend, outside=outside) for b in unit], axis=-1)
-
-    def derivative(
-        self, points: ArrayLike, multi_index: Sequence[int], *, blend: bool = False, outside: str = "nan"
-    ) -> jax.Array:
-        """Any derivative d^b u anywhere.
-
-        Parameters
-        ----------
-        points : array_like (M, D)
-            Where.
-        multi_index : sequence of int (D,)
-            b, the order along each axis, together at most the order.
-        blend : bool
-            Average the polynomials' derivatives, as for values.
-        outside : {"nan", "raise", "extrapolate"}
-            What becomes of points outside of the domain, as for values.
-
-        Returns
-        -------
-        jax.Array
-            (M,), for a system (M, F).
-
-        Raises
-        ------
-        ValueError
-            For wrong points or orders.
-
-        Examples
-        --------
-        >>> import jax; jax.config.update("jax_enable_x64", True)
-        >>> import jsmitsm as js
-        >>> ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(1.0)}
-        >>> problem = js.Problem(lambda u, x: js.laplacian(u)(x) - 6 * x[0], ends)  # x^3
-        >>> sol = js.solve(problem, js.interval(0.0, 1.0, 9))
-        >>> round(float(sol.derivative([[0.5]], (2,))[0]), 9)
-        3.0
-        """
-        self.refuse_stacked()
-        points = checked_points(points, self.cloud.dim)
-        whole = isinstance(multi_index, (tuple, list)) and all(isinstance(v, (int, np.integer)) for v in multi_index)
-        b = tuple(map(int, multi_index)) if whole else ()
-        if len(b) != self.cloud.dim or min(b) < 0 or sum(b) > self.order:
-            raise ValueError(
-                f"multi_index: expected {self.cloud.dim} non-negative orders with a sum of at most {self.order}, "
-                f"got {multi_index!r}"
-            )
-        near, weight = nearest_particles(self.cloud, points, self.cloud.dim + 2 if blend else 1)
-        inside = in_domain(self.cloud, points, outside)
-        values = evaluated(b, self._recipe.reach, self.cloud.points, self._taylor, points, near, weight)
-        values = values if inside is None else jnp.where(inside[:, None], values, jnp.nan)
-        return values[:, 0] if self._recipe.fields == 1 else values
-
-    def integral(self, group: str | None = None) -> jax.Array:
-        """The integral of u over a boundary group, or without a name over the domain.
-
-        That over the domain has the order of the solution, on curved domains too; see ``js.quadrature``.
-
-        Parameters
-        ----------
-        group : str, optional
-            The name of a boundary group.
-
-        Returns
-        -------
-        jax.Array
-            A scalar, for a system (F,); units of u times length, area or volume.
-
-        Raises
-        ------
-        ValueError
-            For a group that is no boundary group.
-
-        Examples
-        --------
-        >>> import jax; jax.config.update("jax_enable_x64", True)
-        >>> import jsmitsm as js
-        >>> ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(1.0)}
-        >>> sol = js.solve(js.Problem(lambda u, x: js.laplacian(u)(x) - 2.0, ends), js.interval(0.0, 1.0, 9))
-        >>> round(float(sol.integral()), 12)  # of x^2
-        0.333333333333
-        """
-        self.refuse_stacked()
-        points, weights, _ = quadrature(self.cloud, group, self.order)
-        return jnp.tensordot(weights, self(points, outside="extrapolate"), axes=1)
-
-    def flux(self, group: str, conductivity: ValueOrFunction = 1.0) -> jax.Array:
-        """The integral of conductivity n . grad u over a boundary group, n outward.
-
-        Parameters
-        ----------
-        group : str
-            The name of a boundary group.
-        conductivity : float or function
-            A number, or a function of one point x (D,).
-
-        Returns
-        -------
-        jax.Array
-            A scalar, for a system (F,).
-
-        Raises
-        ------
-        ValueError
-            For a group that is no boundary group.
-
-        Examples
-        --------
-        >>> import jax; jax.config.update("jax_enable_x64", True)
-        >>> import jsmitsm as js
-        >>> ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(1.0)}
-        >>> problem = js.Problem(lambda u, x: js.laplacian(u)(x) - 6 * x[0], ends)  # x^3
-        >>> sol = js.solve(problem, js.interval(0.0, 1.0, 9))
-        >>> round(float(sol.flux("right", conductivity=2.0)), 9)
-        6.0
-        """
-        self.refuse_stacked()
-        points, weights, normals = quadrature(self.cloud, group)
-        if callable(conductivity):
-            conductivity = jax.vmap(conductivity)(points)
-        elif not is_traced(conductivity) and np.asarray(conductivity).dtype.kind not in "iuf":
-            raise ValueError(f"conductivity: expected a number or a function of one point x, got {conductivity!r}")
-        slope = jnp.einsum("q...d,qd->q...", self.grad(points, outside="extrapolate"), normals)
-        return jnp.tensordot(weights * conductivity, slope, axes=1)
 
     def error_estimate(self) -> Array:
         """Estimated error |u - u_exact| at every particle, by defect correction.
@@ -384,7 +159,7 @@ class Solution:
 
     @property
     def defects(self) -> bool:
-        """Whether the estimate knows defects, and :meth:`correction` more than the size of the error."""
+        """Whether the estimate knows defects, and ``correction`` more than the size of the error."""
         return not hasattr(self._fit, "error_estimate")
 
     def correction(self) -> Correction:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import jsmitsm as js
-from jsmitsm.cloud.line.path import followed
+from jsmitsm.cloud.lattices.path import followed
 
 
 def test_a_number_gives_the_lattice():

@@ -33,7 +33,8 @@ def test_a_free_end_keeps_the_order():
     errors = []
     for n in (11, 21, 41):
         cloud = js.interval(0.0, 1.0, n)
-        sol = js.solve(js.Problem(lambda u, x: fourth(u, x) - fourth(exact, x), bcs), cloud, order=8, depth=0)  # deeper is round-off
+        problem = js.Problem(lambda u, x: fourth(u, x) - fourth(exact, x), bcs)
+        sol = js.solve(problem, cloud, order=8, depth=0)  # deeper is round-off
         errors.append(np.abs(sol.u - jax.vmap(exact)(cloud.points)).max())
     assert errors[2] < 1e-6 and errors[0] / errors[1] > 2**5 < errors[1] / errors[2], errors
 

@@ -249,8 +249,9 @@ def test_states_between_the_steps_are_solutions():
     assert max(np.abs(u - at(smooth, ROD, t)).max() for t, u in zip(run.t, run.u)) < 1e-6
     points = np.array([[0.123], [0.77]])
     state = run.at(0.613)
-    for found, f in ((state(points), smooth), (state.grad(points)[:, 0], lambda x, t: jax.grad(smooth)(x, t)[0])):
-        assert np.abs(found - jax.vmap(lambda x: f(x, 0.613))(points)).max() < 1e-6
+    then = lambda x: smooth(x, 0.613)  # noqa: E731
+    assert np.abs(state(points) - jax.vmap(then)(points)).max() < 1e-6
+    assert np.abs(state.grad(points) - jax.vmap(jax.grad(then))(points)).max() < 1e-6
     assert abs(state.integral() - (np.cos(2 * 0.613) - np.cos(1 + 2 * 0.613))) < 1e-6
     with pytest.raises(ValueError, match="outside of the run, from 0 to 1"):
         run.at(1.2)
@@ -286,6 +287,17 @@ def test_a_run_pickles_and_goes_to_xarray():
     pytest.importorskip("xarray")
     table = run.to_xarray()
     assert table["u"].dims == ("time", "particle") and table["time"].values.tolist() == [0.0, 0.5, 1.0]
+
+
+def test_a_run_goes_to_paraview(tmp_path):
+    meshio = pytest.importorskip("meshio")
+    run = moving_heat(steps=10, save=2)
+    js.files.to_pvd(run, tmp_path / "u.pvd")
+    listed = (tmp_path / "u.pvd").read_text()
+    assert [f'timestep="{t}" file="u_0000{k}.vtu"' in listed for k, t in enumerate(("0.0", "0.5", "1.0"))] == [True] * 3
+    assert np.array_equal(meshio.read(tmp_path / "u_00001.vtu").point_data["u"], run.u[1])
+    with pytest.raises(ValueError, match="path: expected the name of a .pvd file"):
+        js.files.to_pvd(run, tmp_path / "u.vtu")
 
 
 # ------------------------------------------------------------------ gradients
@@ -350,6 +362,10 @@ def evolved(problem=COOLING, u0=1.0, t=(0.0, 1.0), **options):
     return js.evolve(problem, ROD, u0, t, **(options or {"steps": 4}))
 
 
+def stated(pde, **bcs):
+    return evolved(js.Problem(pde, {**COOLING.bcs, **bcs}))
+
+
 @pytest.mark.parametrize(("call", "words"), [
     (lambda: evolved(steps=3, tol=1e-3), "steps, tol: give exactly one"),
     (lambda: evolved(order=4), "steps, tol: give exactly one"),
@@ -364,14 +380,12 @@ def evolved(problem=COOLING, u0=1.0, t=(0.0, 1.0), **options):
     (lambda: evolved(steps=4, save=[2.0]), "save: times from 2 to 2"),
     (lambda: evolved(steps=4, save=0), "save: expected at least 1"),
     (lambda: evolved(steps=4, damping=-1), "damping: expected"),
-    (lambda: evolved(js.Problem(lambda u, x: js.laplacian(u)(x), COOLING.bcs)), r"pde: js.evolve calls it as f\(u, x, t"),
-    (lambda: evolved(js.Problem(lambda u, x, t: js.laplacian(u)(x), COOLING.bcs)), "no rate in it"),
-    (lambda: evolved(js.Problem(lambda u, x, t: u(x) * js.dt(u)(x) - js.laplacian(u)(x), COOLING.bcs)), "divide the eq"),
-    (lambda: evolved(js.Problem(lambda u, x, t: js.dt(u, 2)(x) - js.laplacian(u)(x), COOLING.bcs)), "starts from a pair"),
-    (lambda: evolved(js.Problem(lambda u, x, t: js.dt(u)(x) + js.grad(u)(x)[0], {**COOLING.bcs, "right": js.free()})),
-     "unstable for pure advection"),
-    (lambda: evolved(js.Problem(lambda u, x, t: js.dt(u)(x) + js.grad(u)(x)[0] - 1e-3 * js.laplacian(u)(x), COOLING.bcs)),
-     "cell Peclet number"),
+    (lambda: stated(lambda u, x: js.laplacian(u)(x)), r"pde: js.evolve calls it as f\(u, x, t"),
+    (lambda: stated(lambda u, x, t: js.laplacian(u)(x)), "no rate in it"),
+    (lambda: stated(lambda u, x, t: u(x) * js.dt(u)(x) - js.laplacian(u)(x)), "divide the equation"),
+    (lambda: stated(lambda u, x, t: js.dt(u, 2)(x) - js.laplacian(u)(x)), "starts from a pair"),
+    (lambda: stated(lambda u, x, t: js.dt(u)(x) + js.grad(u)(x)[0], right=js.free()), "unstable for pure advection"),
+    (lambda: stated(lambda u, x, t: js.dt(u)(x) + js.grad(u)(x)[0] - 1e-3 * js.laplacian(u)(x)), "cell Peclet number"),
     (lambda: evolved(js.Problem(COOLING.pde, {**COOLING.bcs, "right": js.condition(
         lambda u, x, n, t: n @ js.grad(u)(x) + u(x) ** 4)})), "the condition is nonlinear in u"),
     (lambda: evolved(js.Problem(lambda u, x, t: js.dt(u)(x) - js.laplacian(u)(x) + u(x) ** 2, COOLING.bcs), steps=4,

@@ -138,7 +138,8 @@ def test_second_order_in_time_is_its_first_order_form():
     n, h = 5, 0.3
     a, m1, m2 = (rng.standard_normal((n, n)) + 3 * np.eye(n) for _ in range(3))
     rows, cols = (v.ravel() for v in np.mgrid[:n, :n])
-    system = System(*(Sparse(a.ravel(), rows, cols, (n, n)), tuple(Sparse(m.ravel(), rows, cols, (n, n)) for m in (m1, m2))))
+    first, *masses = (Sparse(m.ravel(), rows, cols, (n, n)) for m in (a, m1, m2))
+    system = System(first, tuple(masses))
     zero, one = np.zeros((n, n)), np.eye(n)
     mass, stiff = np.block([[one, zero], [zero, m2]]), np.block([[zero, -one], [a, m1]])
     y = rng.standard_normal(2 * n)

@@ -9,8 +9,9 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from jsmitsm.equation.bcs import Condition
 from jsmitsm.equation.conditions import component
-from jsmitsm.equation.problem import Condition, Problem
+from jsmitsm.equation.problem import Problem
 from jsmitsm.equation.regions.interface import INTERFACE
 from jsmitsm.equation.traced import Traced
 from jsmitsm.runtime.errors import did_you_mean

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from jsmitsm.equation.problem import Condition, checked_value
+from jsmitsm.equation.bcs import Condition, checked_value
 from jsmitsm.runtime.arrays import ValueOrFunction
 from jsmitsm.runtime.errors import short
 

@@ -38,7 +38,7 @@ def extras(
     sources: Sequence[PointSource], bcs: Mapping[str, Any],
 ) -> Extras | None:  # fmt: skip
     """What the user gave, judged; None for a problem without any of it."""
-    given = list(constraints) if isinstance(constraints, (list, tuple)) else [constraints]
+    given: list[Any] = list(constraints) if isinstance(constraints, (list, tuple)) else [constraints]
     for k, one in enumerate(given):
         if not isinstance(one, Constraint):
             raise ValueError(f"constraints[{k}]: expected js.constraint(functional, value), got {short(one)}")

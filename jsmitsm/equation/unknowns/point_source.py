@@ -100,7 +100,7 @@ class Singular(NamedTuple):
     a: Any
     m: Any
 
-    def __call__(self, x: Any) -> Any:
+    def at(self, x: Any) -> Any:
         """At one point (D,)."""
         return sum(s * _fundamental(x - p, self.m) for p, s in zip(self.places, self.strengths, strict=True)) / self.a
 
@@ -123,7 +123,7 @@ def _fundamental(way: Any, m: Any) -> Any:
 
 def derivative_of(singular: Singular, multi_index: tuple[int, ...]) -> Any:
     """The function x -> d^b of the singular part."""
-    function: Any = singular
+    function: Any = singular.at
     for axis, count in enumerate(multi_index):
         for _ in range(count):
             function = _along(function, axis)

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm.cloud.cloud import Cloud
-from jsmitsm.equation.problem import Condition, Problem
+from jsmitsm.equation.bcs import Condition
+from jsmitsm.equation.problem import Problem
 from jsmitsm.equation.tracing import trace
 from jsmitsm.equation.unknowns.point_source import FARTHEST, Singular
 from jsmitsm.runtime.errors import IN_FUNCTIONS, in_words, some
@@ -99,7 +100,7 @@ def _regular(problem: Problem, c: Condition, cloud: Cloud, name: str, singular: 
     if c.kind == "free":
         return c
     if c.kind == "condition":
-        return Condition("condition", residual=lambda u, x, *more: c.residual(lambda y: u(y) + singular(y), x, *more))
+        return Condition("condition", residual=lambda u, x, *more: c.residual(lambda y: u(y) + singular.at(y), x, *more))
     if c.kind not in ("dirichlet", "neumann", "robin", "fix"):
         raise ValueError(
             f"bcs[{name!r}]: js.{c.kind} does not go with point sources; put a Gaussian into the pde instead"
@@ -115,13 +116,13 @@ def _regular(problem: Problem, c: Condition, cloud: Cloud, name: str, singular: 
             return jax.vmap(lambda x: jnp.asarray(value(x, *more), float).reshape(()))(points)
         return value
 
-    there = jax.vmap(singular)(points)
+    there = jax.vmap(singular.at)(points)
     if c.kind in ("dirichlet", "fix"):
         rest = {k: v for k, v in c.parts.items() if k != "value"}
         return Condition(c.kind, c.field, **rest, value=sampled(c.value) - there)
     if cloud.normals is None:
         return c  # refused by name later
-    slope = jnp.sum(jax.vmap(jax.grad(singular))(points) * jnp.asarray(cloud.normals)[ids], axis=1)
+    slope = jnp.sum(jax.vmap(jax.grad(singular.at))(points) * jnp.asarray(cloud.normals)[ids], axis=1)
     if c.kind == "neumann":
         return Condition(c.kind, c.field, value=sampled(c.value) - slope)
     a, b = sampled(c.a), sampled(c.b)

@@ -8,7 +8,8 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from jsmitsm.equation.problem import Condition, Problem
+from jsmitsm.equation.bcs import Condition
+from jsmitsm.equation.problem import Problem
 
 
 def stated(problem: Problem, unknowns: Any) -> Problem:

@@ -9,9 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jsmitsm.equation.bcs import Condition
 from jsmitsm.equation.field import LocalField
 from jsmitsm.equation.operators import grad
-from jsmitsm.equation.problem import Condition, Problem
+from jsmitsm.equation.problem import Problem
 from jsmitsm.equation.unknowns.parts import parts
 
 I = np.complex128(1j)
@@ -67,7 +68,8 @@ def _params(params: Any) -> tuple[Any, Callable[[Any], Any]]:
     real = tuple((jnp.real(v), jnp.imag(v)) if two else v for v, two in zip(leaves, paired, strict=True))
 
     def whole(given: Any) -> Any:
-        return tree.unflatten([jax.lax.complex(*v) if two else v for v, two in zip(given, paired, strict=True)])
+        back = [jax.lax.complex(*v) if two else v for v, two in zip(given, paired, strict=True)]
+        return jax.tree.unflatten(tree, back)
 
     return (None if params is None else real), whole
 

@@ -18,9 +18,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm.cloud.cloud import Cloud
+from jsmitsm.equation.bcs import Condition
 from jsmitsm.equation.closing import closed
 from jsmitsm.equation.field import RATE
-from jsmitsm.equation.problem import Condition, Problem
+from jsmitsm.equation.problem import Problem
 from jsmitsm.equation.traced import Traced
 from jsmitsm.equation.tracing import moving, restricted, trace
 from jsmitsm.runtime.errors import IN_FUNCTIONS, in_words

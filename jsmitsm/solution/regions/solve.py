@@ -62,7 +62,7 @@ def finished_regions(run: RegionsRun, values: Any, taylor: Any, good: Any, itera
     """The solution of a run that ended with these values and expansions (None: a linear problem)."""
     disc = run.disc
     run.seconds["total"] = time.perf_counter() - run.began
-    recipe = Recipe("S", disc.rec.order, None, "loo", disc.rec.fields, disc.rec.depth)
+    recipe = Recipe("S", disc.rec.order, None, "loo", disc.rec.fields, disc.rec.depth, tuple(disc.rec.orders))
     fit = RegionsFit(disc.problem, disc.cloud, whole_table(disc), taylor, recipe)
     report = None if is_traced(values) else run
     return RegionsSolution(values, disc.cloud, recipe, fit, good, iterations, run.stats(), report=report)

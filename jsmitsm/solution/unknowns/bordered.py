@@ -36,6 +36,8 @@ class BorderedRun(Run):
         self.lines: Any = self.columns.T
         self.corner: Any = np.zeros((0, 0))
         self.right: Any = np.zeros(0)
+        self.system: tuple[Any, Any, Any] = (np.zeros(0), np.zeros(0, int), np.zeros(0, int))  # entries and places
+        self.parts: list[Any] = []  # of the least-squares form
         self.multipliers = False  # whether the columns are those of free constants
 
     @property

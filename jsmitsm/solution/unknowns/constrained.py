@@ -197,6 +197,7 @@ def _refuse_in_operator(one: Numbers, two: Numbers, name: str) -> None:
 def _refuse_nonlinear(run: BorderedRun, answer: Response, start: Any, unknowns: Any) -> None:
     """The unknowns must have entered as they were taken to."""
     away = np.array([float(unknowns[n] - start[n]) for n in start])
+    assert run.nums is not None
     found = (answer.right, answer.columns @ away, _right(run, run.nums)), (
         answer.nums.held, np.tensordot(away, answer.held, axes=1), run.nums.held
     )  # fmt: skip

@@ -19,6 +19,9 @@ from jsmitsm.solution.solution import Solution
 class PointSolution(Solution):
     """A solution that adds the singular part of its sources; estimates and flags are those of the regular part."""
 
+    regular: Solution
+    singular: Singular
+
     @classmethod
     def of(cls, regular: Solution, singular: Singular) -> PointSolution:
         """The solution whose regular part was solved for."""
@@ -29,7 +32,7 @@ class PointSolution(Solution):
 
     @property
     def u(self) -> Any:
-        return jnp.asarray(self._values[..., 0]) + jax.vmap(self.singular)(jnp.asarray(self.cloud.points))
+        return jnp.asarray(self._values[..., 0]) + jax.vmap(self.singular.at)(jnp.asarray(self.cloud.points))
 
     @property
     def coefficients(self) -> Any:
@@ -64,7 +67,7 @@ class PointSolution(Solution):
 
 def _placeholder(cls: type, leaves: Any) -> Any:
     """What JAX's tree tools make of a solution on their way, of parts that are none."""
-    new = object.__new__(cls)
+    new: Any = object.__new__(cls)
     new.regular, new.singular = leaves
     return new
 

@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from jsmitsm.cloud.cloud import INTERIOR, Cloud, lattice
+from jsmitsm.cloud.cloud import INTERIOR, Cloud
 from jsmitsm.cloud.filling import SpacingLike, divide, spacing_function
-from jsmitsm.cloud.line.path import followed
+from jsmitsm.cloud.lattices.boxes import lattice
+from jsmitsm.cloud.lattices.path import followed
 from jsmitsm.runtime.errors import short
 
 
