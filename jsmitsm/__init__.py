@@ -16,6 +16,8 @@ from jsmitsm.equation.marks import meant
 from jsmitsm.equation.operators import divergence, dt, grad, hessian, laplacian, partial
 from jsmitsm.equation.problem import Problem
 from jsmitsm.equation.regions.interface import interface
+from jsmitsm.equation.unknowns.constraint import constraint
+from jsmitsm.equation.unknowns.point_source import point_source
 from jsmitsm.particle.kernels import Constant, CubicSpline, Gaussian, Kernel, SuperGaussian, Wendland
 from jsmitsm.runtime.errors import SolveError, did_you_mean
 from jsmitsm.runtime.progress import no_progress
@@ -26,11 +28,11 @@ __version__ = "0.2.0"
 __all__ = [
     "Adapted", "Cloud", "Condition", "Constant", "CubicSpline", "Evolution", "Factorization", "Formulation",
     "Gaussian", "Kernel", "Method", "Modes", "Problem", "Quality", "Solution", "SolveError", "Solver", "Stencils",
-    "SuperGaussian", "TuneResult", "Wendland", "adapt", "box", "condition", "continuation", "dirichlet",
+    "SuperGaussian", "TuneResult", "Wendland", "adapt", "box", "condition", "constraint", "continuation", "dirichlet",
     "divergence", "dt", "eigen", "evolve", "factorize", "files", "fix", "free", "from_polygon", "from_sdf", "grad",
     "hessian", "interface", "interval", "laplacian", "meant", "multi_indices", "neumann", "no_progress", "partial",
-    "periodic", "plot", "quadrature", "quality", "rectangle", "regions", "robin", "sdf", "show_versions", "solve",
-    "stencils", "tune",
+    "periodic", "plot", "point_source", "quadrature", "quality", "rectangle", "regions", "robin", "sdf",
+    "show_versions", "solve", "stencils", "tune",
 ]  # fmt: skip
 
 # Imported when first used, the solver too: who draws or makes clouds need not wait for it. Where each stands is said

@@ -199,7 +199,7 @@ PROBLEMS = [
     ("replace-bad-bcs", lambda: js.Problem(poisson, ENDS).replace(bcs=0), "bcs:", "dict"),
 ]
 
-BAD_VALUES = [("nan", NAN), ("inf", INF), ("text", "a"), ("None", None), ("complex", 1j),
+BAD_VALUES = [("nan", NAN), ("inf", INF), ("text", "a"), ("None", None),
               ("ragged", [[1.0], [1.0, 2.0]]), ("bool", True), ("nan-in-array", np.array([0.0, NAN]))]  # fmt: skip
 NUMBERS = "number|finite"
 CONDITIONS = [
@@ -208,6 +208,8 @@ CONDITIONS = [
     *((f"robin-a-{k}", lambda v=v: js.robin(v, 1.0, 0.0), r"\ba:", NUMBERS) for k, v in BAD_VALUES),
     *((f"robin-b-{k}", lambda v=v: js.robin(1.0, v, 0.0), r"\bb:", NUMBERS) for k, v in BAD_VALUES),
     *((f"robin-value-{k}", lambda v=v: js.robin(1.0, 1.0, v), "value:", NUMBERS) for k, v in BAD_VALUES),
+    ("complex-values", lambda: js.Problem(poisson, {**ENDS, "left": js.neumann(1j)}), r"bcs\['left'\]", "dtype=complex"),
+    ("complex-factor", lambda: js.Problem(poisson, {**ENDS, "left": js.robin(1j, 1.0, 0.0)}), r"\ba of", "dtype=complex"),
     ("robin-nothing", lambda: js.robin(0.0, 0.0, 1.0), r"\ba\b.*\bb\b", "js.free|not both"),
     ("field-negative", lambda: js.dirichlet(0.0, field=-1), "field:", "number of a field"),
     ("field-fraction", lambda: js.neumann(0.0, field=0.5), "field:", "number of a field"),

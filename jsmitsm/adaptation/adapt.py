@@ -14,6 +14,7 @@ from jsmitsm.adaptation.measure import NORMS, Quantity
 from jsmitsm.adaptation.rounds import ORDERS, Rounds
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.equation.problem import Problem
+from jsmitsm.equation.unknowns.extras import refuse_extras
 from jsmitsm.linear.linsolve import Solver
 from jsmitsm.runtime.arrays import ValueOrFunction
 from jsmitsm.runtime.errors import did_you_mean, short
@@ -197,6 +198,7 @@ def _checked(problem, make, tol, order, start, quantity, norm, max_particles, ma
     """Arguments judged before any work; the options of a solve."""
     if not isinstance(problem, Problem):
         raise ValueError(f"problem: expected a js.Problem, got {type(problem).__name__}")
+    refuse_extras(problem)
     if not callable(make):
         raise ValueError(
             f"make: expected a function spacing -> js.Cloud, got {type(make).__name__}; write for instance "

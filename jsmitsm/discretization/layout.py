@@ -23,6 +23,7 @@ from jsmitsm.equation.problem import Problem
 from jsmitsm.equation.regions.per_region import PerRegion
 from jsmitsm.equation.traced import Traced
 from jsmitsm.equation.tracing import trace
+from jsmitsm.equation.unknowns.extras import refuse_extras
 from jsmitsm.particle.elimination import Scheme
 from jsmitsm.particle.kernels import Constant, Kernel
 from jsmitsm.particle.recursion import Recursion, free_indices, recursion
@@ -112,6 +113,7 @@ def discretize(
     """
     if isinstance(cloud, RegionCloud) or isinstance(problem.pde, PerRegion):
         raise ValueError("problem: several regions are solved by js.solve alone; this is not made for them")
+    refuse_extras(problem)
     kernel = kernel and kernel.recorded()
     traced = _traced(problem, cloud.dim)
     _check_operator(traced, problem, order)

@@ -296,7 +296,7 @@ def checked_value(value: Any, name: str) -> Any:
     refuse_masked(value, name)
     try:
         array = np.asarray(value)
-        if array.dtype.kind not in "fiu":
+        if array.dtype.kind not in "fiuc":
             raise TypeError
     except (TypeError, ValueError, OverflowError):
         raise ValueError(

@@ -89,7 +89,7 @@ def total(parts: Any) -> Any:
 
 
 def _is_scalar(value: Any) -> bool:
-    return isinstance(value, int | float | np.number | np.ndarray | jax.Array) and np.ndim(value) == 0
+    return isinstance(value, int | float | complex | np.number | np.ndarray | jax.Array) and np.ndim(value) == 0
 
 
 def _needs_point(other: Any) -> TypeError:

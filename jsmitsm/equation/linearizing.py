@@ -375,5 +375,5 @@ def _values(out: Any, dtype: Any) -> jax.Array:
             "did an operator or x keep an axis? (js.grad(u)(x) is a vector, js.laplacian(u)(x) a scalar)"
         )
     if not np.issubdtype(out.dtype, np.floating) and not np.issubdtype(out.dtype, np.integer):
-        raise ValueError(f"the residual must be real, got dtype {out.dtype}; write its two parts as two equations")
+        raise ValueError(f"the residual must be real, got dtype {out.dtype}; take js.Problem(..., dtype=complex)")
     return out.astype(dtype).reshape(-1)

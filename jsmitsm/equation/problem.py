@@ -11,6 +11,9 @@ import numpy as np
 from jsmitsm.equation.bcs import Condition
 from jsmitsm.equation.regions.per_region import PerRegion, per_region
 from jsmitsm.equation.traced import Traced
+from jsmitsm.equation.unknowns.constraint import Constraint
+from jsmitsm.equation.unknowns.extras import Extras, extras
+from jsmitsm.equation.unknowns.point_source import PointSource
 from jsmitsm.runtime.errors import did_you_mean, short
 
 
@@ -34,6 +37,17 @@ class Problem:
     params : pytree, optional
         Any pytree of numbers. Where it is given, every function of the problem takes it as its last argument, and
         new numbers in it never recompile.
+    constraints : sequence of Constraint
+        From ``js.constraint``: numbers made of the solution that have given values. As many as there are unknowns; or
+        without unknowns one for every field that the conditions leave free up to a constant.
+    unknowns : mapping, optional
+        Maps names to the numbers to start from: scalars that are found together with u, such as the potential of an
+        electrode or a Lagrange multiplier. Where there are some, every function of the problem takes them, as a dict,
+        as its last argument: ``pde(u, x, g)``, or ``pde(u, x, params, g)``.
+    dtype : float or complex
+        ``complex`` where u, the residual and the values of the conditions are complex.
+    sources : sequence of PointSource
+        From ``js.point_source``: what the residual is besides zero, strength delta(x - x0) each.
 
     Raises
     ------
@@ -54,6 +68,11 @@ class Problem:
         bcs: Mapping[str, Condition | Sequence[Condition]],
         fields: int = 1,
         params: Any = None,
+        *,
+        constraints: Sequence[Constraint] = (),
+        unknowns: Mapping[str, Any] | None = None,
+        dtype: Any = float,
+        sources: Sequence[PointSource] = (),
     ):
         if isinstance(pde, Mapping):
             pde = per_region(pde)
@@ -66,11 +85,35 @@ class Problem:
                 f"bcs: expected a dict from group name to condition, got {type(bcs).__name__}; "
                 'write e.g. {"left": js.dirichlet(0.0)}'
             )
-        _check_params(params)
+        _check_params(params, dtype is not float)
         self.pde: Any = pde
         self.fields = int(fields)
         self.params = params
         self.bcs = {name: _listed(name, value, self.fields) for name, value in bcs.items()}
+        self.extras = extras(constraints, unknowns, dtype, sources, self.bcs)
+
+    # Constraints and unknowns; most problems have none.
+    extras: Extras | None = None
+
+    @property
+    def constraints(self) -> tuple[Constraint, ...]:
+        """The constraints, in their order."""
+        return () if self.extras is None else self.extras.constraints
+
+    @property
+    def unknowns(self) -> dict[str, Any]:
+        """The global unknowns and the numbers they start from."""
+        return {} if self.extras is None else dict(self.extras.unknowns)
+
+    @property
+    def dtype(self) -> type:
+        """What u is: float or complex."""
+        return complex if self.extras is not None and self.extras.complex_values else float
+
+    @property
+    def sources(self) -> tuple[PointSource, ...]:
+        """The point sources."""
+        return () if self.extras is None else self.extras.sources
 
     def replace(self, **changes: Any) -> Problem:
         """The same problem with other parts.
@@ -78,7 +121,8 @@ class Problem:
         Parameters
         ----------
         **changes : any
-            ``params``, ``pde``, ``bcs`` or ``fields``.
+            ``params``, ``pde``, ``bcs``, ``fields``, ``constraints``, ``unknowns``, ``dtype`` or
+            ``sources``.
 
         Returns
         -------
@@ -97,23 +141,23 @@ class Problem:
         >>> problem.replace(params=2.0).params
         2.0
         """
-        unknown = sorted(set(changes) - {"pde", "bcs", "fields", "params"})
+        names = ("pde", "bcs", "fields", "params", "constraints", "unknowns", "dtype", "sources")
+        unknown = sorted(set(changes) - set(names))
         if unknown:
-            raise ValueError(f"{unknown[0]}: no part of a Problem; it has pde, bcs, fields and params"
-                             + did_you_mean(unknown[0], ("pde", "bcs", "fields", "params")))  # fmt: skip
-        parts = {"pde": self.pde, "bcs": self.bcs, "fields": self.fields, "params": self.params}
-        return Problem(**{**parts, **changes})
+            raise ValueError(f"{unknown[0]}: no part of a Problem; it has {', '.join(names[:-1])} and {names[-1]}"
+                             + did_you_mean(unknown[0], names))  # fmt: skip
+        return Problem(**{**{name: getattr(self, name) for name in names}, **changes})
 
     def tree_flatten(self):
         if isinstance(self.pde, (Traced, PerRegion)):
-            return (self.bcs, self.params, self.pde), (None, self.fields)
-        return (self.bcs, self.params), (self.pde, self.fields)
+            return (self.bcs, self.params, self.extras, self.pde), (None, self.fields)
+        return (self.bcs, self.params, self.extras), (self.pde, self.fields)
 
     @classmethod
     def tree_unflatten(cls, aux, leaves):
         new = object.__new__(cls)
         new.pde, new.fields = aux
-        new.bcs, new.params, *recorded = leaves
+        new.bcs, new.params, new.extras, *recorded = leaves
         if recorded:
             (new.pde,) = recorded
         return new
@@ -124,13 +168,14 @@ class Problem:
         return f"Problem({of}fields={self.fields}, {shown})"
 
 
-def _check_params(params: Any) -> None:
+def _check_params(params: Any, complex_too: bool) -> None:
     """Parameters are finite numbers; traced ones pass."""
+    kinds = "biufc" if complex_too else "biuf"
     for path, leaf in jax.tree_util.tree_leaves_with_path(params):
         if isinstance(leaf, jax.core.Tracer):
             continue
         where = f"params{jax.tree_util.keystr(path)}"
-        if getattr(leaf, "dtype", np.asarray(leaf).dtype if np.isscalar(leaf) else np.dtype(object)).kind not in "biuf":
+        if getattr(leaf, "dtype", np.asarray(leaf).dtype if np.isscalar(leaf) else np.dtype(object)).kind not in kinds:
             raise ValueError(
                 f"{where}: expected a real number or array, got {short(leaf)}; let the pde close over it instead"
             )

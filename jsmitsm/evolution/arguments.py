@@ -12,6 +12,7 @@ from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.cloud.regions.region_cloud import RegionCloud
 from jsmitsm.equation.problem import Problem
 from jsmitsm.equation.regions.per_region import PerRegion
+from jsmitsm.equation.unknowns.extras import refuse_extras
 from jsmitsm.runtime.errors import did_you_mean, refuse_masked, short
 from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.taylor.multi_indices import HIGHEST
@@ -24,6 +25,7 @@ MOST_STEPS = 10_000_000
 
 def check(problem, cloud, t, steps, tol, order, scheme, throw, progress) -> None:
     """ValueError for what cannot be right, with the remedy."""
+    refuse_extras(problem)
     for value, kind, name in ((problem, Problem, "problem"), (cloud, Cloud, "cloud")):
         if not isinstance(value, kind):
             raise ValueError(f"{name}: expected a js.{kind.__name__}, got {type(value).__name__}")

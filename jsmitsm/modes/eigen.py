@@ -13,6 +13,7 @@ from jsmitsm.cloud.neighbours import Stencils
 from jsmitsm.discretization.layout import Discretization
 from jsmitsm.discretization.pencil.assemble import Pencil, assemble_pencil
 from jsmitsm.equation.problem import Problem
+from jsmitsm.equation.unknowns.extras import refuse_extras
 from jsmitsm.modes.estimate import errors
 from jsmitsm.modes.modes import Modes
 from jsmitsm.modes.question import Question, masses, reduced
@@ -165,6 +166,7 @@ def _finished(question: Question, values: Any, right: Any, good: Any, found: Any
 
 def _check(problem: Problem, count: Any, near: Any, method: Any) -> None:
     """Arguments that can be judged before any work."""
+    refuse_extras(problem)
     if method != "S":
         raise ValueError(
             f"method: {method!r} has no pencil: only the rows of method \"S\" know their source; leave it out"

@@ -33,7 +33,7 @@ def between(disc: Discretization, nums: Numbers, problem: Problem, values: Any, 
         disc.classes = [replace(cls, scheme=replace(cls.scheme, sourced=True)) for cls in classes]
         classes, made = all_rows(disc, missed)
     right = np.asarray(right_side(disc, missed, classes, made))
-    solved = factor.solve(np.concatenate([right, np.zeros(len(disc.floating))]))
+    solved = factor.solve(np.concatenate([right, np.zeros(factor.n - len(right))]))
     found[~disc.held.reshape(-1)] = np.abs(solved[: len(right)])
     return found.reshape(disc.held.shape)
 

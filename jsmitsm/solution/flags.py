@@ -223,7 +223,7 @@ def _source(run: Any, values: np.ndarray, nums: Any, out: list[str], found: dict
     if disc.scheme.method in ("I", "II"):
         classes, rows = all_rows(disc, alone)  # their constant part holds the neighbours' sources
     right = np.asarray(right_side(disc, alone, classes, rows))
-    right = np.concatenate([right, np.zeros(len(disc.floating))])
+    right = np.concatenate([right, np.zeros(run.bordering)])
     share = float(np.linalg.norm(run.factor.solve(right)) / (np.linalg.norm(values) or 1.0))
     found["source"] = share
     if share > SOURCE:

@@ -59,6 +59,7 @@ class Run:
         self.rows: tuple[list[Class], list[Row]] | None = None
         self.nums: Numbers | None = None
         self.values: np.ndarray | None = None
+        self.extra: Any = None  # of the last step's unknowns those that are no values of particles
 
     def numbers(self, taylor: Any = None) -> Any:
         """The numbers of the problem, linearised at the expansions ``taylor`` (N, F, K) where it is nonlinear."""
@@ -240,10 +241,11 @@ class Run:
                 particles,
             )
             return np.full(n, np.nan), False
+        self.extra = x[n:]
         if is_traced(x):
             return x[:n], self._solvable(data, r, c, b, x, points) if balanced else True
         x = np.asarray(x)
-        if disc.floating:
+        if self.floating:
             system = linsolve.factor(data, r, c, len(b), points, self.solver, self._elliptic)
             self.imbalance = imbalance(lambda e: system.solve(e, transpose=True), x, b, n)
             if balanced:
@@ -256,7 +258,7 @@ class Run:
         largest = jnp.max(jnp.abs(b), initial=0.0)
         most = GROWN * usual_condition(self.disc) * jnp.where(largest > 0, largest, 1.0)
         good = jnp.max(jnp.abs(x), initial=0.0) <= most
-        if self.disc.floating:
+        if self.floating:
             data, b, x = jax.lax.stop_gradient((data, b, x))
             turned = lambda e: jnp.stack([
                 linsolve.solve(data, c, r, column, n=len(b), points=points, solver=self.solver, elliptic=False)
@@ -266,9 +268,19 @@ class Run:
         return good
 
     @property
+    def floating(self) -> tuple[int, ...]:
+        """The fields that get a multiplier, because nothing fixes their constant."""
+        return self.disc.floating
+
+    @property
+    def bordering(self) -> int:
+        """How many rows and columns the global system has besides those of the particles' values."""
+        return len(self.floating)
+
+    @property
     def _elliptic(self) -> bool:
         """Whether multigrid may be expected to work."""
-        return self.disc.rec.fields == 1 and not self.disc.floating
+        return self.disc.rec.fields == 1 and not self.bordering
 
     def _bordered(self, data: Any, r: Any, c: Any, b: Any) -> tuple[Any, Any, Any, Any, Any]:
         """The system and the places of its unknowns; a row and a column of ones more for every floating field."""

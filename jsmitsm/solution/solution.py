@@ -104,6 +104,11 @@ class Solution(Anywhere):
         return self._values[..., 0] if self._recipe.fields == 1 else self._values
 
     @property
+    def unknowns(self) -> dict[str, Any]:
+        """The global unknowns that were found with u, by their names; none for a problem without them."""
+        return {}
+
+    @property
     def coefficients(self) -> Array:
         """Taylor coefficients d^a u / a!, (N, K), ordered as ``js.multi_indices``; (N, K, F) for a system."""
         fitted = self._taylor

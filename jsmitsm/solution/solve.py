@@ -7,9 +7,14 @@ from typing import Any, Literal
 
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.cloud.neighbours import Stencils
+from jsmitsm.cloud.regions.region_cloud import RegionCloud
 from jsmitsm.discretization.coefficients import numbers
 from jsmitsm.discretization.layout import discretize, table
 from jsmitsm.equation.problem import Problem
+from jsmitsm.equation.regions.per_region import PerRegion
+from jsmitsm.equation.unknowns.regular import regular_problem
+from jsmitsm.equation.unknowns.stated import stated
+from jsmitsm.equation.unknowns.two_fields import two_fields, two_parts
 from jsmitsm.linear.linsolve import Solver
 from jsmitsm.particle.kernels import Kernel
 from jsmitsm.runtime.arrays import ValueOrFunction
@@ -22,6 +27,10 @@ from jsmitsm.solution.order_choice import check_tolerance, of_tolerance
 from jsmitsm.solution.regions.solve import solve_regions
 from jsmitsm.solution.run import Run
 from jsmitsm.solution.solution import Solution
+from jsmitsm.solution.unknowns.bordered import BorderedRun
+from jsmitsm.solution.unknowns.complex_solution import ComplexSolution
+from jsmitsm.solution.unknowns.constrained import solve_constrained
+from jsmitsm.solution.unknowns.point_solution import PointSolution, check_inside
 
 
 @bar("solve")
@@ -107,6 +116,11 @@ def solve(
     check_tolerance(order, tol)
 
     def solved(order: Any) -> Solution:
+        if getattr(problem, "extras", None) is not None:
+            return with_extras(
+                problem, cloud, method=method, order=order, kernel=kernel, stencils=stencils, basis_terms=basis_terms,
+                formulation=formulation, solver=solver, u0=u0, throw=throw, depth=depth,
+            )  # fmt: skip
         if of_regions(problem, cloud):
             return solve_regions(
                 problem, cloud, method=method, order=order, kernel=kernel, stencils=stencils, basis_terms=basis_terms,
@@ -127,14 +141,14 @@ def solve(
 def prepared(
     problem: Problem, cloud: Cloud, *, method: str = "S", order: int = 4, kernel: Kernel | None = None,
     stencils: Stencils | None = None, basis_terms: int | None = None, formulation: str = "auto", solver: str = "auto",
-    u0: Any = None, throw: bool = True, depth: Depth = "auto",
+    u0: Any = None, throw: bool = True, depth: Depth = "auto", kind: type[Run] = Run,
 ) -> Run:  # fmt: skip
-    """Checked arguments of ``js.solve``, discretised."""
+    """Checked arguments of ``js.solve``, discretised; kind: of run that is made of them."""
     start = time.perf_counter()
     check(problem, cloud, method, order, kernel, stencils, formulation, solver, u0, throw, depth)
     disc = discretize(problem, cloud, method, order, kernel, stencils, basis_terms, sources=False, depth=depth)
     problem = disc.problem
-    run = Run(disc, problem, solver, throw, kernel is None and stencils is None, formulation)
+    run = kind(disc, problem, solver, throw, kernel is None and stencils is None, formulation)
     run.began, run.seconds["set-up"] = start, time.perf_counter() - start
     if not disc.classes:
         raise ValueError("problem: every particle's value is held; nothing is left to solve for")
@@ -143,12 +157,42 @@ def prepared(
 
 def finished(run: Run, values: Any, taylor: Any, good: Any, iterations: Any) -> Solution:
     """The solution of a run that ended with these values and expansions (None: a linear problem)."""
-    disc, scheme = run.disc, run.disc.scheme
+    disc, recipe = run.disc, recipe_of(run)
     run.seconds["total"] = time.perf_counter() - run.began
-    recipe = Recipe(
-        scheme.method, disc.rec.order, disc.basis_terms, run.formulation, disc.rec.fields,
-        disc.rec.depth, tuple(disc.rec.orders),
-    )  # fmt: skip
     fit = Fit(run.problem, disc.cloud, disc.kernel, table(disc), taylor, recipe)
     report = None if is_traced(values) else run
     return Solution(values, disc.cloud, recipe, fit, good, iterations, run.stats(), report=report)
+
+
+def recipe_of(run: Run) -> Recipe:
+    rec = run.disc.rec
+    return Recipe(
+        run.disc.scheme.method, rec.order, run.disc.basis_terms, run.formulation, rec.fields, rec.depth,
+        tuple(rec.orders),
+    )  # fmt: skip
+
+
+def with_extras(problem: Problem, cloud: Cloud, *, order: Any, **options: Any) -> Solution:
+    """The solution of a problem with constraints, complex values or point sources; options as those of ``js.solve``."""
+    assert problem.extras is not None
+    if isinstance(cloud, RegionCloud) or isinstance(problem.pde, PerRegion):
+        raise ValueError(
+            "problem: constraints, unknowns, sources and dtype=complex are not made for several regions; use one region"
+        )
+    if problem.extras.complex_values:
+        if options["method"] not in ("S", "SSPH"):
+            raise ValueError(f'method: {options["method"]} treats one real field; use "S" for dtype=complex')
+        options["u0"] = two_parts(options["u0"], problem.fields)
+        return ComplexSolution.of(solve(two_fields(problem), cloud, order=order, **options))
+    if problem.extras.sources:
+        regular, singular = regular_problem(problem, cloud)
+        check_inside(singular, cloud)
+        return PointSolution.of(solve(regular, cloud, order=order, **options), singular)
+    run = prepared(stated(problem, problem.extras.unknowns), cloud, order=order, kind=BorderedRun, **options)
+    assert isinstance(run, BorderedRun)
+
+    def again(order: int) -> Any:
+        other = {"method": "S", "depth": run.disc.rec.depth, "solver": options["solver"]}
+        return solve(problem, cloud, order=order, **other)._values
+
+    return solve_constrained(problem, run, recipe_of(run), again)

@@ -1,0 +1,55 @@
+"""A problem with global unknowns stated as a plain one: the unknowns ride in its params."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from typing import Any
+
+import jax.numpy as jnp
+
+from jsmitsm.equation.bcs import Condition
+from jsmitsm.equation.problem import Problem
+
+
+def stated(problem: Problem, unknowns: Any) -> Problem:
+    """The plain problem at given unknowns: its params are the pair of the problem's own and of them."""
+    assert problem.extras is not None
+    if not problem.extras.unknowns:  # constraints alone: its functions are called as ever
+        return Problem(problem.pde, problem.bcs, problem.fields, problem.params)
+    given = problem.params is not None
+    try:
+        inspect.signature(problem.pde).bind(*[None] * (4 if given else 3))
+    except TypeError as error:
+        called = "pde(u, x, params, unknowns)" if given else "pde(u, x, unknowns)"
+        raise ValueError(f"pde: {error}; with unknowns it is called as {called}, all other functions alike") from None
+    except ValueError:  # a callable without a signature
+        pass
+    bcs = {name: [_condition(c, given) for c in cs] for name, cs in problem.bcs.items()}
+    return Problem(_function(problem.pde, given), bcs, problem.fields, (problem.params, floats(unknowns)))
+
+
+def at(plain: Problem, unknowns: Any) -> Problem:
+    """A problem of ``stated`` (recorded or not) with other unknowns."""
+    if not unknowns:
+        return plain
+    leaves = plain.bcs, (plain.params[0], floats(unknowns))
+    new = object.__new__(Problem)
+    new.pde, new.fields, (new.bcs, new.params) = plain.pde, plain.fields, leaves
+    return new
+
+
+def floats(unknowns: Any) -> dict[str, Any]:
+    return {name: jnp.asarray(value, float) for name, value in unknowns.items()}
+
+
+def _function(function: Callable[..., Any], given: bool) -> Callable[..., Any]:
+    """A user's function of (..., params, unknowns), or (..., unknowns) without params, as one of (..., pair)."""
+    if given:
+        return lambda *args: function(*args[:-1], *args[-1])
+    return lambda *args: function(*args[:-1], args[-1][1])
+
+
+def _condition(c: Condition, given: bool) -> Condition:
+    parts = {name: _function(v, given) if callable(v) else v for name, v in c.parts.items()}
+    return Condition(c.kind, c.field, **parts)

@@ -1,0 +1,1 @@
+"""Solutions of problems that have more than equations and conditions: constraints, global unknowns, complex values."""

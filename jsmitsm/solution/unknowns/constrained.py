@@ -1,0 +1,244 @@
+"""Solve a linear problem with constraints: the bordered system, in Newton steps where a constraint is not linear."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jsmitsm.discretization.coefficients import Numbers, numbers
+from jsmitsm.discretization.layout import table
+from jsmitsm.discretization.least_squares import least_squares_right_side
+from jsmitsm.discretization.leave_one_out import right_side, with_held
+from jsmitsm.equation.problem import Problem
+from jsmitsm.equation.unknowns.stated import at, floats
+from jsmitsm.runtime.errors import IN_FUNCTIONS, in_words
+from jsmitsm.runtime.progress import bar
+from jsmitsm.runtime.tracers import concrete, is_traced
+from jsmitsm.solution.fit import Fit, Recipe
+from jsmitsm.solution.unknowns.bordered import BorderedRun
+from jsmitsm.solution.unknowns.solution import ConstrainedSolution, Probe
+from jsmitsm.taylor.multi_indices import HIGHEST
+
+# A constraint is met when it misses by this part of what it is made of; round-off of the fits leaves 1e-12.
+MET, STEPS = 1e-9, 20
+# An unknown enters linearly if twice as much of it does twice as much, up to round-off.
+LINEAR = 1e-9
+
+
+@jax.tree_util.register_pytree_node_class
+class ConstrainedFit(Fit):
+    """A fit whose error estimate is the distance to the solution of another order, unknowns and all."""
+
+    def __init__(self, problem, cloud, kernel, neighbours, taylor, recipe, again=None):
+        super().__init__(problem, cloud, kernel, neighbours, taylor, recipe)
+        self.again: Callable[[int], Any] | None = again  # the values at another order
+
+    @bar("error estimate")
+    def error_estimate(self, values: Any) -> Any:
+        if self.again is None:
+            raise ValueError(
+                "error_estimate: this solution went through a JAX transform, which kept nothing to compare it with; "
+                "ask the one that js.solve returned"
+            )
+        order = self.recipe.order
+        error = abs(self.again(order + 2 if order + 2 <= HIGHEST else order - 2) - values)
+        return error[:, 0] if self.recipe.fields == 1 else error
+
+
+@dataclass
+class Response:
+    """How the system answers to the unknowns: numbers at the start, change of right-hand side and held values."""
+
+    nums: Numbers
+    right: Any  # (n,)
+    columns: Any  # (n, K)
+    held: Any  # (K, N, F)
+
+
+def solve_constrained(
+    problem: Problem, run: BorderedRun, recipe: Recipe, again: Callable[[int], Any]
+) -> ConstrainedSolution:
+    """The solution of a problem with constraints, from the run of its plain problem.
+
+    recipe: of the solution, once the run has assembled; again: the values at another order.
+    """
+    assert problem.extras is not None
+    constraints, start = problem.extras.constraints, floats(problem.extras.unknowns)
+    _check(problem, run)
+    disc, names = run.disc, list(start)
+    run.multipliers = not names
+    answer = _response(run, start)
+    recipe = replace(recipe, formulation=run.formulation)
+
+    def missed(values: Any, unknowns: Any) -> Any:
+        """By how much the constraints (K,) are missed."""
+        fit = Fit(at(run.problem, unknowns), disc.cloud, disc.kernel, table(disc), None, recipe)
+        probe = Probe(values, disc.cloud, recipe, fit, True, 1, {}, unknowns=unknowns)
+        return jnp.stack([_value(c, probe, k) for k, c in enumerate(constraints)])
+
+    run.columns = run.constants() if run.multipliers else -answer.columns
+    free = np.flatnonzero(~disc.held.reshape(-1))
+    # Linear constraints do not care where they are linearised; others must not have a flat spot there.
+    unknowns, values, good = start, with_held(disc, answer.nums, np.ones(len(free))), True
+    for step in range(1, STEPS + 1):  # noqa: B007
+        rest, pull = jax.vjp(missed, jnp.asarray(values, float), unknowns)
+        slopes = [pull(row) for row in np.eye(len(constraints))]
+        by_value = jnp.stack([v.reshape(-1) for v, _ in slopes])  # (K, N F)
+        by_unknown = jnp.stack([jnp.stack([g[n] for n in names]) for _, g in slopes]) if names else jnp.zeros((1, 0))
+        lines = _of_free(disc, by_value)
+        away = jnp.stack([unknowns[n] - start[n] for n in names]) if names else jnp.zeros(0)
+        # The constraints are written about u = the held values at the start, g = the start.
+        moved = by_value @ (with_held(disc, answer.nums, np.zeros(len(free))) - values).reshape(-1) - by_unknown @ away
+        corner = by_unknown + by_value @ answer.held.reshape(len(names), -1).T if names else None
+        run.lines, run.right = _host(lines), _host(-(rest + moved))
+        run.corner = np.zeros((len(constraints),) * 2) if corner is None else _host(corner)
+        x, well = _solved(run, answer)
+        if names:
+            unknowns = {n: start[n] + run.extra[k] for k, n in enumerate(names)}
+        change = sum((answer.held[k] * (unknowns[n] - start[n]) for k, n in enumerate(names)), 0.0)
+        values = with_held(disc, answer.nums, x) + change
+        rest = missed(values, unknowns)
+        size = abs(by_value) @ abs(values).reshape(-1) + sum(
+            (abs(by_unknown[:, k] * unknowns[n]) for k, n in enumerate(names)),
+            abs(jnp.stack([jnp.asarray(c.value, float) for c in constraints])),
+        )
+        met = jnp.all(abs(rest) <= MET * jnp.where(size > 0, size, 1.0))
+        good = good & well
+        if concrete(met) is None or bool(concrete(met)) or not bool(concrete(jnp.isfinite(rest).all())):
+            break
+    return _finished(run, answer, start, unknowns, values, good & met, step, recipe, again)
+
+
+def _finished(run, answer, start, unknowns, values, good, steps, recipe, again) -> ConstrainedSolution:
+    """Judge what came out, and hand it on."""
+    disc, names = run.disc, list(start)
+    problem = at(run.problem, unknowns)
+    traced = is_traced(values, unknowns)
+    if not traced:
+        values, run.disc, run.problem = np.asarray(values), run.moved(unknowns), problem
+        run.nums, run.values = run.numbers(), values
+        if names:
+            _refuse_nonlinear(run, answer, start, unknowns)
+        if not bool(good) and not run.failed and np.isfinite(values).all():
+            run.fail(f"the constraints are not met after {steps} step(s) of Newton's method; are they possible?")
+        good = bool(good) and not run.failed and bool(np.isfinite(values).all())
+    run.seconds["total"] = time.perf_counter() - run.began
+    own = ConstrainedFit(problem, disc.cloud, disc.kernel, table(disc), None, recipe, None if traced else again)
+    stats = run.stats()
+    return ConstrainedSolution(
+        values, disc.cloud, recipe, own, good, steps, stats, report=None if traced else run, unknowns=unknowns
+    )
+
+
+def _check(problem: Problem, run: BorderedRun) -> None:
+    """As many constraints as unknowns, of a problem that is linear in u."""
+    assert problem.extras is not None
+    constraints, unknowns = problem.extras.constraints, problem.extras.unknowns
+    floating = run.disc.floating
+    if not run.disc.linear:
+        raise ValueError(
+            "constraints: the problem is nonlinear in u, and constraints are made for linear ones; solve it for given "
+            "unknowns and find them outside, e.g. with scipy.optimize.root on the functional"
+        )
+    if run.disc.scheme.method in ("I", "II"):
+        raise ValueError(f'method: {run.disc.scheme.method} is not made for constraints; use "S", "III" or "SSPH"')
+    wanted = len(unknowns) or len(floating)
+    if len(constraints) != wanted:
+        named = f" ({', '.join(unknowns)})" if unknowns else ""
+        constant = f"; nothing else fixes the constant of {len(floating)} field(s), which take one each"
+        raise ValueError(
+            f"constraints: got {len(constraints)} for {len(unknowns)} unknown(s){named}; give one for each unknown"
+            + ("" if unknowns else constant if floating else ', e.g. unknowns={"q": 0.0}, and let the pde use it')
+        )
+
+
+def _response(run: BorderedRun, start: dict[str, Any]) -> Response:
+    """Assemble at the start, and once more for every unknown moved by one."""
+    names = list(start)
+    parts: list[Any] = []
+    nums = run.numbers()
+    data, r, c, right = run.assembled(nums, parts)
+    run.system, run.parts = (data, r, c), parts
+    columns, held = [], []
+    for name in names:
+        disc = run.moved({**start, name: start[name] + 1.0})
+        there = numbers(disc, disc.problem)
+        _refuse_in_operator(nums, there, name)
+        columns.append(_right(run, there) - right)
+        held.append((there.held - nums.held)[run.disc.partner])
+    xp: Any = jnp if is_traced(columns, held) else np
+    empty = np.zeros((len(right), 0)), np.zeros((0, *np.shape(nums.held)))
+    return Response(nums, right, *((xp.stack(columns, 1), xp.stack(held)) if names else empty))
+
+
+def _right(run: BorderedRun, nums: Numbers) -> Any:
+    if run.formulation == "lsq":
+        return least_squares_right_side(run.disc, nums, run.parts)
+    assert run.rows is not None
+    return right_side(run.disc, nums, *run.rows)
+
+
+def _refuse_in_operator(one: Numbers, two: Numbers, name: str) -> None:
+    for a, b in ((one.jac, two.jac), (one.own, two.own), (one.data, two.data)):
+        a, b = concrete(a), concrete(b)
+        if a is not None and b is not None and not np.array_equal(np.asarray(a), np.asarray(b)):
+            raise ValueError(
+                f"unknowns: {name!r} multiplies u or a derivative of it; unknowns enter as sources and as values of "
+                "conditions. For an eigenvalue take js.eigen, or a field of its own with zero slope"
+            )
+
+
+def _refuse_nonlinear(run: BorderedRun, answer: Response, start: Any, unknowns: Any) -> None:
+    """The unknowns must have entered as they were taken to."""
+    away = np.array([float(unknowns[n] - start[n]) for n in start])
+    assert run.nums is not None
+    found = (answer.right, answer.columns @ away, _right(run, run.nums)), (
+        answer.nums.held, np.tensordot(away, answer.held, axes=1), run.nums.held
+    )  # fmt: skip
+    for first, moved, there in found:
+        size = max(np.abs(part).max(initial=0.0) for part in (first, moved, there))
+        if np.isfinite(there).all() and np.abs(first + moved - there).max(initial=0.0) > LINEAR * size:
+            raise ValueError(
+                f"unknowns: {', '.join(map(repr, start))} enter the equation or the conditions nonlinearly; only "
+                "linear terms are made for it: take the term itself for the unknown, as q for exp(a)"
+            )
+
+
+def _solved(run: BorderedRun, answer: Response) -> tuple[Any, Any]:
+    began = time.perf_counter()
+    x, good = run.solved(*run.system, answer.right)
+    run.seconds["solve"] += time.perf_counter() - began
+    if is_traced(x):
+        return x, jnp.isfinite(x).all() & good
+    return x, bool(good) and bool(np.isfinite(x).all())
+
+
+def _value(c: Any, probe: Probe, k: int) -> Any:
+    try:
+        found = jnp.asarray(c.functional(probe))
+    except IN_FUNCTIONS as error:
+        raise ValueError(
+            f"constraints[{k}]: calling functional(sol) failed: {in_words(error)}; write it with jax.numpy, of what "
+            "sol offers: u, values and derivatives at points, integral, flux, unknowns"
+        ) from error
+    if found.shape or jnp.iscomplexobj(found):
+        raise ValueError(f"constraints[{k}]: functional(sol) must return a real scalar, got shape {found.shape}")
+    return found - c.value
+
+
+def _of_free(disc: Any, by_value: Any) -> Any:
+    """Slopes (K, n) by the unknowns, from those by all values (K, N F): a periodic image adds to its partner's."""
+    number = disc.unknowns.reshape(-1)
+    place = np.flatnonzero(number >= 0)
+    count = int((~disc.held).sum())
+    return jnp.zeros((len(by_value), count)).at[:, number[place]].add(by_value[:, place])
+
+
+def _host(x: Any) -> Any:
+    return x if is_traced(x) else np.asarray(x)

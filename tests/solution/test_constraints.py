@@ -1,0 +1,149 @@
+"""Constraints and global unknowns: values against exact solutions, gradients against formulas, and bad input."""
+
+import pickle
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jsmitsm as js
+
+SQUARE = js.rectangle((0.0, 0.0), (1.0, 1.0), (11, 11), jitter=0.2)
+ROD = js.interval(0.0, 1.0, 11)
+
+
+def electrode(k, charge=3.0, **more):
+    """k laplacian(u) = x: u = x^3 / 6k + c x with the flux `charge` through the right, whose potential is found."""
+    return js.Problem(
+        lambda u, x, k, g: k * js.laplacian(u)(x) - x[0],
+        {"left": js.dirichlet(0.0), "right": js.dirichlet(lambda x, k, g: g["V"]), "top": js.neumann(0.0),
+         "bottom": js.neumann(0.0)},
+        params=k, unknowns={"V": 0.3}, constraints=[js.constraint(lambda sol: sol.flux("right"), charge)], **more,
+    )  # fmt: skip
+
+
+def test_a_floating_electrode_and_its_gradient():
+    """V = c + 1 / 6k with c = 3 - 1 / 2k, a polynomial of the order: exact to round-off."""
+    sol = js.solve(electrode(2.0), SQUARE)
+    x = SQUARE.points[:, 0]
+    assert abs(sol.u - (x**3 / 12 + 2.75 * x)).max() < 1e-11
+    assert abs(sol.unknowns["V"] - (3 - 1 / 6)) < 1e-11
+    assert sol.converged and not sol.flags and sol.error_estimate().max() < 1e-10
+
+
+def test_gradients_and_jit():
+    """u'' k = x in 1D: V = Q - 1 / 3k."""
+
+    def rod(k, charge):
+        ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(lambda x, k, g: g["V"])}
+        given = [js.constraint(lambda sol: sol.flux("right"), charge)]
+        pde = lambda u, x, k, g: k * js.laplacian(u)(x) - x[0]
+        return js.solve(js.Problem(pde, ends, params=k, unknowns={"V": 0.3}, constraints=given), ROD)
+
+    potential = lambda k, charge: rod(k, charge).unknowns["V"]
+    by_k, by_charge = jax.grad(potential, (0, 1))(2.0, 3.0)
+    assert abs(by_k - 1 / 12) < 1e-9 and abs(by_charge - 1.0) < 1e-9
+    sol = jax.jit(rod)(2.0, 3.0)
+    assert bool(sol.converged) and abs(sol.unknowns["V"] - (3 - 1 / 6)) < 1e-10
+
+
+def test_slopes_all_around_with_a_multiplier_and_a_mean():
+    """laplacian(u) = 4 - q with slopes of x^2 - y^2: the multiplier q = 4 makes the data balance."""
+    exact = lambda x: x[0] ** 2 - x[1] ** 2
+    slope = js.condition(lambda u, x, n, g: n @ (js.grad(u)(x) - js.grad(exact)(x)))
+    problem = js.Problem(
+        lambda u, x, g: js.laplacian(u)(x) - 4.0 + g["q"], {s: slope for s in ("left", "right", "top", "bottom")},
+        unknowns={"q": 0.0}, constraints=[js.constraint(lambda sol: sol.integral(), 5.0)],
+    )  # fmt: skip
+    sol = js.solve(problem, SQUARE)
+    assert abs(sol.unknowns["q"] - 4.0) < 1e-9
+    assert abs(sol.u - (jax.vmap(exact)(SQUARE.points) + 5.0)).max() < 1e-9
+    assert abs(sol.integral() - 5.0) < 1e-11
+
+
+@pytest.mark.parametrize(
+    "functional, value",
+    [(lambda s: s([[0.5]])[0], 2.0), (lambda s: s.integral(), 2 + 1 / 6 - 1 / 8), (lambda s: s.u[0], 2 - 1 / 8)],
+)
+def test_a_constraint_without_unknowns_fixes_the_free_constant(functional, value):
+    """u'' = 1 with slopes 0 and 1: u = x^2 / 2 + 2 - 1 / 8."""
+    ends = {"left": js.neumann(0.0), "right": js.neumann(1.0)}
+    pde = lambda u, x: js.laplacian(u)(x) - 1.0
+    sol = js.solve(js.Problem(pde, ends, constraints=[js.constraint(functional, value)]), ROD)
+    x = ROD.points[:, 0]
+    assert abs(sol.u - (x**2 / 2 + 2 - 1 / 8)).max() < 1e-12 and sol.unknowns == {} and not sol.flags
+    unbalanced = js.Problem(pde, {**ends, "right": js.neumann(2.0)}, constraints=[js.constraint(functional, value)])
+    with pytest.raises(js.SolveError, match="do not balance"):
+        js.solve(unbalanced, ROD)
+
+
+def test_two_unknowns_in_a_system_and_a_constraint_between_them():
+    """u'' = a, v'' = b x with the means of both and a + b given: u = a (x^2 - x) / 2, v = b (x^3 - x) / 6."""
+    ends = {side: js.dirichlet(0.0) for side in ("left", "right")}
+    pde = lambda u, x, g: jnp.stack([js.laplacian(u[0])(x) - g["a"], js.laplacian(u[1])(x) - g["b"] * x[0]])
+    both = js.constraint(lambda s: s.unknowns["a"] + s.unknowns["b"], 1.0)
+    given = [js.constraint(lambda s: s.integral()[0], -0.5), both]
+    sol = js.solve(js.Problem(pde, ends, fields=2, unknowns={"b": 0.0, "a": 1.0}, constraints=given), ROD)
+    x = np.asarray(ROD.points[:, 0])
+    assert abs(sol.unknowns["a"] - 6.0) < 1e-9 and abs(sol.unknowns["b"] + 5.0) < 1e-9
+    assert abs(sol.u - np.stack([3 * (x**2 - x), -5 * (x**3 - x) / 6], 1)).max() < 1e-10
+    again = pickle.loads(pickle.dumps(sol))
+    assert again.unknowns == sol.unknowns and abs(again([[0.3]]) - sol([[0.3]])).max() < 1e-14
+
+
+def test_a_constraint_that_is_not_linear_is_met_by_newton_steps():
+    """u'' = q, u = q (x^2 - x) / 2: the integral of u^2 over the particles' polynomials, q > 0."""
+    ends = {side: js.dirichlet(0.0) for side in ("left", "right")}
+    square = js.constraint(lambda s: jnp.mean(s.u**2), 1.0)
+    pde = lambda u, x, g: js.laplacian(u)(x) - g["q"]
+    sol = js.solve(js.Problem(pde, ends, unknowns={"q": 1.0}, constraints=[square]), ROD)
+    assert sol.converged and 2 < sol.iterations < 12 and abs(jnp.mean(sol.u**2) - 1.0) < 1e-8
+
+
+def test_what_is_refused():
+    ends = {side: js.dirichlet(0.0) for side in ("left", "right")}
+    mean = js.constraint(lambda s: s.integral(), 1.0)
+    pde = lambda u, x, g: js.laplacian(u)(x) - g["q"]
+    one = dict(unknowns={"q": 0.0}, constraints=[mean])
+    refused = [
+        (dict(pde=pde, unknowns={"q": 0.0}), "1 unknown.*no constraint"),
+        (dict(pde=pde, unknowns={"q": 0.0}, constraints=[mean, mean]), "got 2 for 1 unknown"),
+        (dict(pde=lambda u, x: js.laplacian(u)(x), constraints=[mean]), "got 1 for 0 unknown"),
+        (dict(pde=pde, unknowns={"q": 0.0}, constraints=[lambda s: 0.0]), r"constraints\[0\]: expected js.constraint"),
+        (dict(pde=pde, unknowns={"q": "a"}, constraints=[mean]), r"unknowns\['q'\]: expected a number"),
+        (dict(pde=pde, unknowns=["q"], constraints=[mean]), "unknowns: expected a dict"),
+        (dict(pde=lambda u, x, g: js.laplacian(u)(x) - jnp.exp(g["q"]), **one), "nonlinearly"),
+        (dict(pde=lambda u, x, g: js.laplacian(u)(x) + g["q"] * u(x) - 1.0, **one), "multiplies u"),
+        (dict(pde=lambda u, x, g: js.laplacian(u)(x) + u(x) ** 2 - g["q"], **one), "nonlinear in u"),
+        (dict(pde=pde, unknowns={"q": 0.0}, constraints=[js.constraint(lambda s: s.u)]), "must return a real scalar"),
+        (dict(pde=pde, unknowns={"q": 0.0}, constraints=[js.constraint(lambda s: s.nothing)]), "nothing"),
+    ]  # fmt: skip
+    for given, told in refused:
+        with pytest.raises(ValueError, match=told):
+            js.solve(js.Problem(given.pop("pde"), ends, **given), ROD)
+    with pytest.raises(ValueError, match="functional: expected a function"):
+        js.constraint(1.0)
+    with pytest.raises(ValueError, match="value: NaN"):
+        js.constraint(lambda s: s.u[0], np.nan)
+    problem = js.Problem(pde, ends, unknowns={"q": 0.0}, constraints=[mean])
+    others = [
+        lambda: js.factorize(problem, ROD),
+        lambda: js.eigen(problem, ROD, 2),
+        lambda: js.evolve(problem, ROD, lambda x: 0.0, t=(0.0, 1.0), steps=2),
+        lambda: js.tune(problem, ROD, js.SuperGaussian(ROD.spacing, 3.0)),
+        lambda: js.adapt(problem, lambda h: js.interval(0.0, 1.0, spacing=h), 1e-3),
+        lambda: js.solve(problem, ROD, method="I"),
+    ]  # fmt: skip
+    for ask in others:
+        with pytest.raises(ValueError, match="constraints"):
+            ask()
+
+
+def test_a_singular_set_of_constraints_fails_by_name():
+    ends = {side: js.dirichlet(0.0) for side in ("left", "right")}
+    same = js.constraint(lambda s: s.integral(), 1.0)
+    pde = lambda u, x, g: js.laplacian(u)(x) - g["p"] - g["q"] * x[0]
+    problem = js.Problem(pde, ends, unknowns={"p": 0.0, "q": 0.0}, constraints=[same, same])
+    with pytest.raises(js.SolveError, match="constraints"):
+        js.solve(problem, ROD)

@@ -1,0 +1,139 @@
+"""Point sources: Green's functions, fundamental solutions against scipy's, gradients, and what is refused."""
+
+import pickle
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.special import k0, y0
+
+import jsmitsm as js
+from jsmitsm.equation.unknowns.point_source import Singular
+
+DISK = js.from_sdf(js.sdf.circle((0.0, 0.0), 1.0), ((-1.0, -1.0), (1.0, 1.0)), 0.15)
+Y = np.array([0.31, -0.22])
+SQUARE = js.rectangle((0.0, 0.0), (1.0, 1.0), (11, 11), jitter=0.2)
+SIDES = ("left", "right", "top", "bottom")
+
+
+def green(x):
+    """Of the unit disk, by the image charge."""
+    image = Y / (Y @ Y)
+    away = lambda p: jnp.log(jnp.linalg.norm(x - p))
+    return (away(Y) - jnp.log(jnp.linalg.norm(Y)) - away(image)) / (2 * jnp.pi)
+
+
+def laplace(u, x):
+    return js.laplacian(u)(x)
+
+
+@pytest.mark.parametrize(
+    "boundary",
+    [
+        js.dirichlet(0.0),
+        js.robin(2.0, 1.0, lambda x: 3.0 * jax.grad(green)(x) @ x),
+        js.condition(lambda u, x, n: u(x) * (1.0 + u(x) ** 2)),
+    ],
+    ids=["dirichlet", "robin", "nonlinear"],
+)
+def test_greens_function_of_the_disk(boundary):
+    """At order 6 the regular part, a harmonic function with its pole at 2.6 radii, is right to 1e-7 of 3."""
+    problem = js.Problem(laplace, {"boundary": boundary}, sources=[js.point_source(Y, 3.0)])
+    sol = js.solve(problem, DISK, order=6)
+    assert sol.converged and not sol.flags
+    assert abs(sol.u - 3.0 * jax.vmap(green)(DISK.points)).max() < 1e-7
+    points = np.array([[0.3, 0.4], [0.31, -0.2], [-0.9, 0.0]])
+    assert abs(sol(points) - 3.0 * jax.vmap(green)(points)).max() < 1e-7
+    slope = 3.0 * jax.vmap(jax.grad(green))(points)
+    assert abs(sol.grad(points) / slope - 1.0).max() < 1e-6
+    assert np.isnan(sol([[2.0, 0.0]])[0])
+    assert abs(sol.flux("boundary") - 3.0) < 1e-5  # what the source gives leaves
+
+
+def test_a_source_survives_pickling_and_jit():
+    problem = js.Problem(laplace, {"boundary": js.dirichlet(0.0)}, sources=[js.point_source(Y)])
+    sol = js.solve(problem, DISK)
+    again = pickle.loads(pickle.dumps(sol))
+    assert abs(again(Y[None] + 0.1) - sol(Y[None] + 0.1)).max() < 1e-14
+    assert abs(jax.tree.map(lambda v: v, sol).u - sol.u).max() == 0.0
+
+
+def test_gradients_by_place_and_strength():
+    """u(z) = s G(z, y): by s it is G, by y a derivative of the image formula."""
+    z, ends = np.array([[-0.4, 0.3]]), {"boundary": js.dirichlet(0.0)}
+    value = lambda y, s: js.solve(js.Problem(laplace, ends, sources=[js.point_source(y, s)]), DISK, order=6)(z)[0]
+    by_place, by_strength = jax.grad(value, (0, 1))(jnp.asarray(Y), 2.0)
+    assert abs(by_strength - green(z[0])) < 1e-7
+
+    def exact(y):
+        image = y / (y @ y)
+        away = lambda p: jnp.log(jnp.linalg.norm(z[0] - p))
+        return 2.0 * (away(y) - jnp.log(jnp.linalg.norm(y)) - away(image)) / (2 * jnp.pi)
+
+    assert abs(by_place - jax.grad(exact)(jnp.asarray(Y))).max() < 1e-6
+
+
+@pytest.mark.parametrize("dim", [1, 2, 3])
+def test_singular_parts_solve_the_equation(dim, m=9.0):
+    """Away from the source (laplacian + m) is zero, and a unit flux leaves a small ball."""
+    part = Singular(np.zeros((1, dim)), np.ones(1), 1.0, m)
+    x = jnp.array([0.7, -0.4, 0.5])[:dim]
+    rest = jax.jit(lambda x: jnp.trace(jax.hessian(part.at)(x)) + m * part.at(x))(x)
+    assert abs(rest) < 1e-12
+    near = 1e-4 * jnp.eye(dim)[0]
+    strength = {1: 2.0, 2: 2 * jnp.pi * 1e-4, 3: 4 * jnp.pi * 1e-8}[dim] * jax.grad(part.at)(near)[0]
+    assert abs(strength - 1.0) < 1e-5  # the flux out of a small ball
+
+
+@pytest.mark.parametrize("c", [16.0, -16.0])
+def test_helmholtz_and_screened_poisson(c):
+    """2 (laplacian + c / 2 ...) with Y0(k r) / 8 and -K0(k r) / (4 pi) on the boundary: k^2 = |c| / 2."""
+    place, k = np.array([0.43, 0.37]), np.sqrt(abs(c) / 2)
+    radius = lambda x: np.linalg.norm(np.asarray(x) - place, axis=-1)
+    exact = lambda x: y0(k * radius(x)) / 8 if c > 0 else -k0(k * radius(x)) / (4 * np.pi)
+    bcs = {s: js.dirichlet(exact(SQUARE.points[SQUARE.groups[s]])) for s in SIDES}
+    problem = js.Problem(
+        lambda u, x: 2.0 * js.laplacian(u)(x) + c * u(x), bcs, sources=[js.point_source(place)]
+    )
+    sol = js.solve(problem, SQUARE, order=6)
+    assert abs(sol.u - exact(SQUARE.points)).max() < 1e-6
+
+
+def test_one_dimension_and_two_sources_beside_a_smooth_one():
+    """u'' = 2 + delta(x - 0.33) - delta(x - 0.61) with ends held: polynomials by pieces."""
+    line = js.interval(0.0, 1.0, 11)
+    sources = [js.point_source([0.33]), js.point_source([0.61], -1.0)]
+    hat = lambda x: jnp.maximum(x - 0.33, 0.0) - jnp.maximum(x - 0.61, 0.0)
+    bcs = {"left": js.dirichlet(0.0), "right": js.neumann(2.0)}
+    sol = js.solve(js.Problem(lambda u, x: js.laplacian(u)(x) - 2.0, bcs, sources=sources), line)
+    x = line.points[:, 0]
+    assert abs(sol.u - (x**2 + hat(x))).max() < 1e-12
+
+
+def test_what_is_refused():
+    ends = {"boundary": js.dirichlet(0.0)}
+    there = [js.point_source(Y)]
+    refused = [
+        (lambda u, x: js.divergence(lambda y: (1 + y[0] ** 2) * js.grad(u)(y))(x), there, "Gaussian"),
+        (lambda u, x: js.laplacian(u)(x) + js.grad(u)(x)[0], there, "first, mixed or higher"),
+        (lambda u, x: js.partial(u, (2, 0))(x) + 2 * js.partial(u, (0, 2))(x), there, "same in all directions"),
+        (lambda u, x: js.laplacian(u)(x) - u(x) ** 2, there, "nonlinear"),
+        (lambda u, x: js.laplacian(u)(x) + 400.0 * u(x), there, "as seen from x0.*Gaussian"),
+        (laplace, [js.point_source([2.0, 0.0])], "outside of the domain"),
+        (laplace, [js.point_source(DISK.points[DISK.groups["interior"][3]])], "where u is infinite"),
+        (laplace, [js.point_source([0.1, 0.2, 0.3])], "3 coordinate"),
+        (laplace, [3.0], r"sources\[0\]: expected js.point_source"),
+    ]
+    for pde, sources, told in refused:
+        with pytest.raises(ValueError, match=told):
+            js.solve(js.Problem(pde, ends, sources=sources), DISK)
+    wrong = [("a", 1.0, "x0: expected one point"), ([np.nan], 1.0, "x0: NaN"), ([0.0], "b", "strength")]
+    for x0, strength, told in wrong:
+        with pytest.raises(ValueError, match=told):
+            js.point_source(x0, strength)
+    problem = js.Problem(laplace, ends, sources=there)
+    sol = js.solve(problem, DISK)
+    for ask in (sol.integral, lambda: sol.coefficients, lambda: js.factorize(problem, DISK)):
+        with pytest.raises(ValueError, match="point source"):
+            ask()
