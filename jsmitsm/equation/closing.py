@@ -95,7 +95,7 @@ def _named(where: str, expected: str) -> Iterator[None]:
 def _shaped(result: Any, components: int, where: str) -> Any:
     if jnp.iscomplexobj(result):
         raise ValueError(
-            f"{where}: expected real numbers, got complex ones; take jnp.real of them, or js.Problem(..., dtype=complex)"
+            f"{where}: expected real numbers, got complex ones; take jnp.real of them or js.Problem(..., dtype=complex)"
         )
     result = jnp.asarray(result, float)
     if result.size == components and result.ndim <= 1:

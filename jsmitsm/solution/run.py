@@ -241,10 +241,10 @@ class Run:
                 particles,
             )
             return np.full(n, np.nan), False
+        x = x if is_traced(x) else np.asarray(x)
         self.extra = x[n:]
         if is_traced(x):
             return x[:n], self._solvable(data, r, c, b, x, points) if balanced else True
-        x = np.asarray(x)
         if self.floating:
             system = linsolve.factor(data, r, c, len(b), points, self.solver, self._elliptic)
             self.imbalance = imbalance(lambda e: system.solve(e, transpose=True), x, b, n)

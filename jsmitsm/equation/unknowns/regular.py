@@ -100,7 +100,8 @@ def _regular(problem: Problem, c: Condition, cloud: Cloud, name: str, singular: 
     if c.kind == "free":
         return c
     if c.kind == "condition":
-        return Condition("condition", residual=lambda u, x, *more: c.residual(lambda y: u(y) + singular.at(y), x, *more))
+        whole = lambda u: lambda y: u(y) + singular.at(y)  # noqa: E731
+        return Condition("condition", residual=lambda u, x, *more: c.residual(whole(u), x, *more))
     if c.kind not in ("dirichlet", "neumann", "robin", "fix"):
         raise ValueError(
             f"bcs[{name!r}]: js.{c.kind} does not go with point sources; put a Gaussian into the pde instead"
