@@ -133,8 +133,10 @@ def fit_and_tail(rec: Recursion) -> tuple[np.ndarray, np.ndarray, np.ndarray, np
     degrees = np.array([sum(a) for a in multi_indices(rec.dim, rec.reach)])
     weighted = np.concatenate([degrees + (w if rec.depth else 0) for w in rec.weights])
     behind = np.array([sum(c) + rec.orders[e] for e, c in _rows(rec)])
-    columns = np.flatnonzero(weighted <= rec.order), np.flatnonzero((weighted > rec.order) & (weighted <= rec.reach))
-    return *columns, np.flatnonzero(behind <= rec.order), np.flatnonzero(behind > rec.order)
+    masks = weighted <= rec.order, (weighted > rec.order) & (weighted <= rec.reach), behind <= rec.order
+    # JAX takes no whole numbers of 64 bits where float64 is off.
+    low, high, first, deeper = (np.flatnonzero(m).astype(np.int32) for m in (*masks, behind > rec.order))
+    return low, high, first, deeper
 
 
 @lru_cache(maxsize=64)
