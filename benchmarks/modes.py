@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import json
 import time
+from argparse import Namespace
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -224,8 +225,7 @@ def table(lines: list[dict[str, Any]]) -> dict[str, Any]:
     return {"columns": columns, "rows": rows, "note": note}
 
 
-def main() -> None:
-    given = arguments(__doc__, "quick", names="case")
+def main(given: Namespace) -> None:
     unknown = sorted(set(given.names) - set(CASES))
     if unknown:
         raise SystemExit(f"{unknown[0]}: none of {', '.join(CASES)}")
@@ -242,4 +242,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    main(arguments(__doc__, "quick", names="case"))

@@ -9,7 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm.cloud.cloud import Cloud
+from jsmitsm.cloud.regions.region_cloud import RegionCloud
 from jsmitsm.equation.problem import Problem
+from jsmitsm.equation.regions.per_region import PerRegion
 from jsmitsm.equation.unknowns.extras import refuse_extras
 from jsmitsm.runtime.errors import did_you_mean, refuse_masked, short
 from jsmitsm.runtime.tracers import is_traced
@@ -27,6 +29,8 @@ def check(problem, cloud, t, steps, tol, order, scheme, throw, progress) -> None
     for value, kind, name in ((problem, Problem, "problem"), (cloud, Cloud, "cloud")):
         if not isinstance(value, kind):
             raise ValueError(f"{name}: expected a js.{kind.__name__}, got {type(value).__name__}")
+    if isinstance(cloud, RegionCloud) or isinstance(problem.pde, PerRegion):
+        raise ValueError("problem: js.evolve does problems of one region; several are done by js.solve alone")
     if not isinstance(t, (tuple, list)) or len(t) != 2:
         raise ValueError(f"t: expected the start and the end, t=(t0, t1), got {short(t)}")
     if not is_traced(t):

@@ -38,7 +38,7 @@ def eigen(
     mass: ValueOrFunction | None = None,
     method: str = "S",
     order: int = 6,
-    depth: Depth = 0,
+    depth: Depth = "auto",
     stencils: Stencils | None = None,
     throw: bool = True,
 ) -> Modes:

@@ -109,13 +109,14 @@ def assemble_pencil(
     mass (F,): which equations have a source that matters (u_t, or lambda u); all, if not given. stencils: the user's,
     which are not repaired. depth: degrees beyond the order of both the recursion and the fit of the source; "auto" is
     2 in 1D and 2D, where errors of values were 30 to 400 times smaller and no mode grew in time, 0 in 3D, where the
-    source's stencils would be too wide.
+    source's stencils would be too wide, and where given ones are too narrow for it.
 
     Raises ValueError for stencils that are too narrow, SolveError for rows that determine nothing.
     """
-    if depth == "auto":
-        depth = _DEPTH[cloud.dim]
+    free, depth = depth == "auto", _DEPTH[cloud.dim] if depth == "auto" else depth
     disc = discretize(problem, cloud, "S", order, None, stencils, None, depth=depth)
+    if free and stencils is not None and _narrowest(stencils) < source_stencil_size(disc.rec, 0):
+        disc = discretize(problem, cloud, "S", order, None, stencils, None, depth=0)
     if taylor is None and not disc.linear:
         raise ValueError(
             "problem: its pde or a condition is nonlinear in u, but a pencil, and modes, are those of a linear "
@@ -124,6 +125,12 @@ def assemble_pencil(
     nums = numbers(disc, disc.problem, taylor)
     massed = np.ones(problem.fields, bool) if mass is None else np.asarray(mass, bool)
     return pencil_of(*laid_out(disc, nums, massed), nums)
+
+
+def _narrowest(stencils: Stencils) -> int:
+    """The least number of neighbours; those of traced stencils are not counted."""
+    index = stencils.indices
+    return index.shape[1] if is_traced(index) else int((np.asarray(index) >= 0).sum(axis=1).min())
 
 
 def laid_out(disc: Discretization, nums: Numbers, massed: np.ndarray) -> tuple[Layout, list[Part] | None]:

@@ -24,6 +24,7 @@ from jsmitsm.equation.field import RATE
 from jsmitsm.equation.problem import Problem
 from jsmitsm.equation.traced import Traced
 from jsmitsm.equation.tracing import moving, restricted, trace
+from jsmitsm.runtime.collector import uncollected
 from jsmitsm.runtime.errors import IN_FUNCTIONS, in_words
 from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.taylor.multi_indices import Slot
@@ -100,6 +101,7 @@ def timed(problem: Problem, cloud: Cloud) -> Timed:
     changing, source_moves = moving(whole, TIME)
     rates = [[s for s in whole.slots if s[0] // RATE == j] for j in (1, 2)]
     _check_rates(rates, changing)
+    _check_constraints(whole, problem.fields)
     space = [s for s in whole.slots if s[0] < RATE]
     linear = [s for s in space if s not in changing]
     operator = restricted(whole, linear, affine=True)
@@ -124,6 +126,28 @@ def _check_rates(rates: list[list[Slot]], changing: set[Slot]) -> None:
                 f"pde: the coefficient of the rate of field {slot[0] % RATE} depends on u or on t; divide the equation "
                 "by it, so that js.dt(u)(x) stands alone or with a factor that depends on x"
             )
+
+
+def _check_constraints(whole: Traced, fields: int) -> None:
+    """ValueError unless the equations without a rate determine the fields without one."""
+    field, kind = (np.array([s[0] % RATE for s in whole.slots]), np.array([s[0] // RATE for s in whole.slots]))
+    still = np.setdiff1d(np.arange(fields), field[kind > 0])
+    if not len(still):
+        return
+    without = np.flatnonzero(~whole.pattern[:, kind > 0].any(axis=1))
+    stands = np.array([whole.pattern[:, (kind == 0) & (field == k)].any(axis=1) for k in still], bool)[:, without]
+    with uncollected():
+        from scipy.sparse import csr_array
+        from scipy.sparse.csgraph import maximum_bipartite_matching
+
+    found = maximum_bipartite_matching(csr_array(stands), perm_type="column")
+    if (found < 0).any():
+        names = ", ".join(str(k) for k in still[found < 0])
+        raise ValueError(
+            f"pde: field {names} has no rate, and no equation without a rate determines it, as with the pressure "
+            "beside div u = 0 (a constraint of index 2), which js.evolve does not do; solve for a stream function, or "
+            "for the steady flow by js.solve"
+        )
 
 
 def _check_conditions(problem: Problem) -> bool:
