@@ -73,9 +73,9 @@ def point_source(x0: ArrayLike, strength: float = 1.0) -> PointSource:
     ...     {"boundary": js.dirichlet(0.0)},
     ...     sources=[js.point_source((0.01, 0.0), 2.0 * np.pi)],
     ... )
-    >>> sol = js.solve(problem, disk)  # log r
-    >>> round(float(sol([[0.51, 0.0]])[0] - np.log(0.51)), 3)
-    0.0
+    >>> sol = js.solve(problem, disk)  # log of 0.5 / 0.9949, by the image at x = 100
+    >>> round(float(sol([[0.51, 0.0]])[0]), 3)
+    -0.688
     """
     if is_traced(x0):
         place = x0
