@@ -77,7 +77,7 @@ WRONG = {
                                {"order": 2}), "source"),
     "waves": (lambda: (st.problem("wave", 2, {"k": 2 * np.pi / (4.8 * st.spacing(2))}), st.lattice(2, 0.2), {}),
               "waves"),
-    "resonance": (lambda: (st.problem("resonance", 1, {**st.at_home(1), "k": float(np.pi)}), st.lattice(1, 0.2), {}),
+    "resonance": (lambda: (st.problem("resonance", 1, {**st.at_home(1), "k": float(np.pi)}), st.lattice(1, 0.2), {"depth": 0}),
                   "nearly singular"),
 }  # fmt: skip
 
@@ -89,6 +89,14 @@ def test_what_is_wrong_is_flagged(name):
     sol = js.solve(task, cloud, **options)
     assert any(words in f for f in sol.flags), sol.flags
     assert "FLAG" in sol.diagnose()
+
+
+def test_a_resonance_met_to_all_digits_is_refused():
+    """Deep enough the discrete resonance is the true one."""
+    make, _ = WRONG["resonance"]
+    task, cloud, _ = make()
+    with pytest.raises(js.SolveError, match="at a resonance"):
+        js.solve(task, cloud)
 
 
 @pytest.mark.parametrize("method", ["S", "III", "SSPH", "I", "II"])

@@ -179,8 +179,11 @@ def tune(
 
 def _chosen(problem: Problem, cloud: Cloud, options: dict[str, Any]) -> Kernel:
     """The kernel that ``js.solve`` takes where none is given."""
-    disc = discretized(problem, cloud, options["method"], options["order"], None, options.get("stencils"))
-    return default_kernel(disc.points, np.arange(len(cloud)), disc.stencils.indices)
+    disc = discretized(
+        problem, cloud, options["method"], options["order"], None, options.get("stencils"),
+        depth=options.get("depth", "auto"),
+    )  # fmt: skip
+    return default_kernel(disc.points, np.arange(len(cloud)), disc.stencils.indices, disc.scheme.decay)
 
 
 def _checked_names(kernel: Kernel, parameters: Any) -> tuple[str, ...]:

@@ -279,7 +279,7 @@ def test_the_kernel_of_solve_where_none_is_given():
     found = room.tune(problem, cloud, steps=3, progress=False)
     start = js.solve(problem, cloud)
     np.testing.assert_allclose(found.history["h"][0] / found.kernel.h, (found.history["h"][0] / found.kernel.h)[0])
-    kernel = found.kernel.replace(h=found.history["h"][0], d=2.0)
+    kernel = found.kernel.replace(h=found.history["h"][0], d=found.history["d"][0])
     apart = np.linalg.norm(np.asarray(js.solve(problem, cloud, kernel=kernel).u - start.u))
     assert apart < 1e-12 * np.linalg.norm(start.u)
     assert found.history["objective"].min() <= found.history["objective"][0]
