@@ -42,10 +42,13 @@ def kink(start, order, n):
 # Twice the errors of the discretisation; the matrix, whose condition is about 1e7, leaves 2e-8 of round-off.
 @pytest.mark.parametrize("order, ceilings", [(2, (4e-3, 1e-3)), (4, (4e-5, 3e-6)), (6, (6e-7, 1e-7))])
 def test_a_kink_is_reached_from_everywhere(order, ceilings):
-    """Its place is nearly free: the linearised equation is nearly singular there, and singular on the way."""
+    """Its place is nearly free: the linearised equation is nearly singular there, and singular on the way.
+
+    From the straight line it comes there without depth first, and goes on with it: the steps of both are counted.
+    """
     for n, ceiling in zip((61, 121), ceilings):
         for start, most in (
-            (None, 30), (lambda x: x[0] / 6, 14), (lambda x: jnp.sign(x[0]), 9), (lambda x: jnp.tanh(x[0] / ROOT), 5)
+            (None, 30), (lambda x: x[0] / 6, 20), (lambda x: jnp.sign(x[0]), 9), (lambda x: jnp.tanh(x[0] / ROOT), 5)
         ):  # fmt: skip
             sol, error = kink(start, order, n)
             assert sol.converged and sol.iterations <= most and error < ceiling
@@ -161,7 +164,7 @@ def test_it_ends_quadratically_on_random_particles(order):
 
 def test_what_was_tried_is_told():
     bratu = js.Problem(lambda u, x: js.laplacian(u)(x) + 5.0 * jnp.exp(u(x)), ends(0.0, 0.0))
-    with pytest.raises(js.SolveError, match="damped steps, pseudo-time steps, full steps were tried, .*stages"):
+    with pytest.raises(js.SolveError, match="damped steps, steps without depth, pseudo-time steps, full steps were tried, .*stages"):
         js.solve(bratu, js.interval(0.0, 1.0, 21))
 
 
