@@ -48,7 +48,7 @@ def test_a_kink_is_reached_from_everywhere(order, ceilings):
     """
     for n, ceiling in zip((61, 121), ceilings):
         for start, most in (
-            (None, 30), (lambda x: x[0] / 6, 20), (lambda x: jnp.sign(x[0]), 9), (lambda x: jnp.tanh(x[0] / ROOT), 5)
+            (None, 36), (lambda x: x[0] / 6, 20), (lambda x: jnp.sign(x[0]), 9), (lambda x: jnp.tanh(x[0] / ROOT), 5)
         ):  # fmt: skip
             sol, error = kink(start, order, n)
             assert sol.converged and sol.iterations <= most and error < ceiling
