@@ -8,6 +8,7 @@ import json
 import re
 import shutil
 import subprocess
+import sys
 import threading
 from pathlib import Path
 
@@ -27,7 +28,7 @@ def site(tmp_path_factory):
     for name in ("material", "mkdocstrings", "latex2mathml"):
         pytest.importorskip(name, reason='pip install ".[docs]"')
     folder = tmp_path_factory.mktemp("site")
-    command = ["python", "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(folder)]
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(folder)]
     made = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert made.returncode == 0, made.stdout + made.stderr
     return folder
