@@ -22,7 +22,7 @@ def line():
 def solved(case, t, problem, method, form="auto"):
     return js.solve(
         problem(t), case.moved(t), method=method, order=3, formulation=form,
-        kernel=js.SuperGaussian(h=t["h"], d=t["d"]), stencils=case.stencils,
+        kernel=js.SuperGaussian(h=t["h"], d=t["d"]), stencils=case.stencils, depth=0,
     )  # fmt: skip
 
 

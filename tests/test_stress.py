@@ -77,7 +77,8 @@ WRONG = {
                                {"order": 2}), "source"),
     "waves": (lambda: (st.problem("wave", 2, {"k": 2 * np.pi / (4.8 * st.spacing(2))}), st.lattice(2, 0.2), {}),
               "waves"),
-    "resonance": (lambda: (st.problem("resonance", 1, {**st.at_home(1), "k": float(np.pi)}), st.lattice(1, 0.2), {"depth": 0}),
+    "resonance": (lambda: (st.problem("resonance", 1, {**st.at_home(1), "k": float(np.pi)}), st.lattice(1, 0.2),
+                           {"depth": 0}),
                   "nearly singular"),
 }  # fmt: skip
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from jsmitsm.discretization.coefficients import Numbers
 from jsmitsm.discretization.layout import Class, Discretization
+from jsmitsm.particle.recursion import fit_and_tail
 from jsmitsm.runtime.progress import each, shown
 from jsmitsm.runtime.size_classes import cloud_size, padded_size
 from jsmitsm.runtime.threads import cores, side_by_side
@@ -76,7 +77,8 @@ def _worth(nums: Numbers, classes: list[Class]) -> int:
 def work(nums: Numbers, cls: Class) -> int:
     """How much the system of one particle is to make, in numbers."""
     rec = cls.scheme.rec
-    columns = rec.size * rec.fields
+    # Of a flat operator the tail is zero, and only the fit is looked at.
+    columns = len(fit_and_tail(rec)[0]) if cls.scheme.flat else rec.size * rec.fields
     matrix = cls.neighbours.shape[1] * columns * _TIMES.get(cls.scheme.method, 1)
     return matrix + (columns**3 // 4 if nums.jac.shape[-1] > 1 else 0)
 

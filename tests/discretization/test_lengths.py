@@ -42,12 +42,13 @@ CASES = {
 
 @pytest.mark.parametrize("name", CASES)
 def test_the_same_solution_as_with_an_elimination_for_each(name, monkeypatch):
+    """Where the recursion ends with the fit: the ridge that holds deeper tails down knows the length."""
     make, options = CASES[name]
     cloud = make()
     posed = problem(cloud, robin=name == "graded")
-    few = js.solve(posed, cloud, order=4, **options)
+    few = js.solve(posed, cloud, order=4, depth=0, **options)
     monkeypatch.setattr(local_data, "_WORTH", 10**9)
-    each = js.solve(posed, cloud, order=4, **options)
+    each = js.solve(posed, cloud, order=4, depth=0, **options)
     told = [line for line in few.stats["skipped"] if line.startswith("recursion per particle, but for")]
     assert len(told) == 1 and not [line for line in each.stats["skipped"] if line.startswith("recursion")]
     lengths = int(told[0].split()[-2])

@@ -164,7 +164,8 @@ def test_it_ends_quadratically_on_random_particles(order):
 
 def test_what_was_tried_is_told():
     bratu = js.Problem(lambda u, x: js.laplacian(u)(x) + 5.0 * jnp.exp(u(x)), ends(0.0, 0.0))
-    with pytest.raises(js.SolveError, match="damped steps, steps without depth, pseudo-time steps, full steps were tried, .*stages"):
+    tried = "damped steps, steps without depth, pseudo-time steps, full steps were tried, .*stages"
+    with pytest.raises(js.SolveError, match=tried):
         js.solve(bratu, js.interval(0.0, 1.0, 21))
 
 
