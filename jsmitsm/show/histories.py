@@ -182,7 +182,22 @@ def adaptation(found: Any, *, ax: Any = None) -> np.ndarray:
     Spacings are distances to the nearest particle, as colours of the particles in 2D, else against x or, in 3D, against
     the distance from the finest place; a round is a dot with its order.
 
-    ``found``: a ``js.Adapted``. ``ax``: three axes. Returns them. Raises ValueError for anything else.
+    Parameters
+    ----------
+    found : Adapted
+        What ``js.adapt`` returned.
+    ax : sequence of matplotlib axes, optional
+        Three of them, to be drawn on.
+
+    Returns
+    -------
+    numpy.ndarray
+        The three axes.
+
+    Raises
+    ------
+    ValueError
+        For what is no ``js.Adapted``.
 
     Examples
     --------

@@ -17,14 +17,27 @@ def animate(run: Any, *, field: int = 0, frames: int | None = None, interval: fl
 
     Parameters
     ----------
-    run : a :class:`jsmitsm.Evolution`.
-    field : the field of a system.
-    frames : so many moments, equally spaced and interpolated between the steps; the saved ones if not given.
-    interval : milliseconds between two of them.
-    ax : axes.
+    run : Evolution
+        What ``js.evolve`` returned.
+    field : int
+        The field of a system.
+    frames : int, optional
+        So many moments, equally spaced and interpolated between the steps; the saved ones if not given.
+    interval : float
+        Milliseconds between two of them.
+    ax : matplotlib axes, optional
+        Where it is drawn.
 
-    Write it with ``.save("u.gif")``. Raises ValueError for what is no evolution, for a field that does not exist, and
-    in 3D, where :func:`jsmitsm.files.to_pvd` writes a series for ParaView.
+    Returns
+    -------
+    matplotlib.animation.FuncAnimation
+        Write it with ``.save("u.gif")``.
+
+    Raises
+    ------
+    ValueError
+        For what is no evolution, for a field that does not exist, and in 3D, where ``js.files.to_pvd`` writes a series
+        for ParaView.
 
     Examples
     --------
@@ -77,8 +90,35 @@ def animate(run: Any, *, field: int = 0, frames: int | None = None, interval: fl
 def to_pvd(run: Any, path: Any) -> None:
     """Write an evolution as a series for ParaView: ``path`` (.pvd) lists the saved times, a .vtu file each beside it.
 
-    Raises ValueError for what is no evolution, and for a path that is none of a .pvd file in a folder that exists.
     Needs meshio: ``pip install "jsmitsm[mesh]"``.
+
+    Parameters
+    ----------
+    run : Evolution
+        What ``js.evolve`` returned.
+    path : str or path
+        Of a .pvd file in a folder that exists.
+
+    Returns
+    -------
+    None
+
+    Raises
+    ------
+    ValueError
+        For what is no evolution, and for another path.
+
+    Examples
+    --------
+    >>> import jax; jax.config.update("jax_enable_x64", True)
+    >>> import os, tempfile, jax.numpy as jnp, jsmitsm as js
+    >>> ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(0.0)}
+    >>> heat = js.Problem(lambda u, x, t: js.dt(u)(x) - js.laplacian(u)(x), ends)
+    >>> run = js.evolve(heat, js.interval(0.0, 1.0, 11), lambda x: jnp.sin(jnp.pi * x[0]), t=(0, 0.1), steps=8)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     js.files.to_pvd(run, os.path.join(folder, "rod.pvd"))
+    ...     len(os.listdir(folder))
+    3
     """
     meshio = needed("meshio", "mesh")
     cloud = _evolution(run).cloud
