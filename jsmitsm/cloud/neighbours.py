@@ -17,6 +17,7 @@ from jsmitsm.runtime.errors import short
 from jsmitsm.runtime.interrupts import interruptible
 from jsmitsm.runtime.progress import bar
 from jsmitsm.runtime.threads import cores
+from jsmitsm.runtime.tracers import owned
 
 # Neighbours at the same distance up to this enter together: rounding must not choose among them.
 _TIE = 1e-7
@@ -116,10 +117,15 @@ def stencils(cloud: Cloud, *, size: int | None = None, radius: ArrayLike | None 
         return _of_regions(cloud, size, radius)
     points = np.asarray(cloud.points)
     if size is None:
-        return within(points, radius)
+        return _unchanging(within(points, radius))
     if isinstance(size, bool) or not isinstance(size, (int, np.integer)) or size < 2:
         raise ValueError(f"size: expected a whole number of at least 2 (the particle itself counts), got {short(size)}")
-    return nearest(points, int(size))
+    return _unchanging(nearest(points, int(size)))
+
+
+def _unchanging(found: Stencils) -> Stencils:
+    """With arrays that nobody can change: what rests on them may be kept."""
+    return jax.tree.map(owned, found)
 
 
 def _of_regions(cloud: RegionCloud, size: int | None, radius: ArrayLike | None) -> Stencils:
@@ -134,7 +140,7 @@ def _of_regions(cloud: RegionCloud, size: int | None, radius: ArrayLike | None) 
         index = np.asarray(one.indices)
         near[ids[:, None], np.arange(one.width)] = np.where(index >= 0, ids[index], -1)
         reach[ids] = one.radius
-    return Stencils(near, reach)
+    return _unchanging(Stencils(near, reach))
 
 
 def nearest(points: np.ndarray, size: int, which: np.ndarray | None = None) -> Stencils:
