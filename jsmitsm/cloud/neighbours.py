@@ -17,7 +17,6 @@ from jsmitsm.runtime.errors import short
 from jsmitsm.runtime.interrupts import interruptible
 from jsmitsm.runtime.progress import bar
 from jsmitsm.runtime.threads import cores
-from jsmitsm.runtime.tracers import owned
 
 # Neighbours at the same distance up to this enter together: rounding must not choose among them.
 _TIE = 1e-7
@@ -117,15 +116,10 @@ def stencils(cloud: Cloud, *, size: int | None = None, radius: ArrayLike | None 
         return _of_regions(cloud, size, radius)
     points = np.asarray(cloud.points)
     if size is None:
-        return _unchanging(within(points, radius))
+        return within(points, radius)
     if isinstance(size, bool) or not isinstance(size, (int, np.integer)) or size < 2:
         raise ValueError(f"size: expected a whole number of at least 2 (the particle itself counts), got {short(size)}")
-    return _unchanging(nearest(points, int(size)))
-
-
-def _unchanging(found: Stencils) -> Stencils:
-    """With arrays that nobody can change: what rests on them may be kept."""
-    return jax.tree.map(owned, found)
+    return nearest(points, int(size))
 
 
 def _of_regions(cloud: RegionCloud, size: int | None, radius: ArrayLike | None) -> Stencils:
@@ -140,7 +134,7 @@ def _of_regions(cloud: RegionCloud, size: int | None, radius: ArrayLike | None) 
         index = np.asarray(one.indices)
         near[ids[:, None], np.arange(one.width)] = np.where(index >= 0, ids[index], -1)
         reach[ids] = one.radius
-    return _unchanging(Stencils(near, reach))
+    return Stencils(near, reach)
 
 
 def nearest(points: np.ndarray, size: int, which: np.ndarray | None = None) -> Stencils:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import jax
@@ -29,8 +29,10 @@ from jsmitsm.particle.kernels import Constant, Kernel
 from jsmitsm.particle.recursion import Recursion, free_indices, recursion
 from jsmitsm.runtime.compiled import at_hand
 from jsmitsm.runtime.errors import IN_FUNCTIONS, in_words
-from jsmitsm.runtime.recall.recording import Same
 from jsmitsm.runtime.tracers import concrete, is_traced, owned
+
+# Bytes of the user's stencils that are quickly compared.
+_LARGE = 1 << 22
 
 
 @dataclass
@@ -38,13 +40,14 @@ class Class:
     """Particles whose moment systems have the same shape.
 
     ids (n,) ascending, neighbours (n, w), the particle itself first and -1 for none; wide: whether their stencils are
-    wider than those of most.
+    wider than those of most; kept: what others found for the class, which lasts as long as it does.
     """
 
     ids: np.ndarray
     neighbours: Any
     scheme: Scheme
     wide: bool = False
+    kept: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 
 
 @dataclass
@@ -190,19 +193,15 @@ def _placed(
             )
         elif found.radius is not None and not is_traced(found):  # those of a former solve were looked at then
             found = seen(found, None, walls)
-        return Placed(held, partner, images, n_own, walls, found, _numbered(held, partner), [])
+        free = ~held.reshape(-1)
+        unknowns = np.where(free, np.cumsum(free) - 1, -1).reshape(held.shape)[partner]
+        return Placed(held, partner, images, n_own, walls, found, unknowns, [])
 
-    if is_traced(stencils) or (stencils is None and kernel is not None):
+    given = [] if stencils is None else jax.tree.leaves(stencils)
+    if is_traced(given) or (stencils is None and kernel is not None) or sum(x.nbytes for x in given) > _LARGE:
         return place()
-    given = None if stencils is None else (Same(stencils.indices), Same(stencils.radius))
-    return cloud.kept((scheme, conditions, pairs, given), place)
-
-
-def _numbered(held: np.ndarray, partner: np.ndarray) -> np.ndarray:
-    number = np.full(held.size, -1)
-    free = ~held.reshape(-1)
-    number[free] = np.arange(free.sum())
-    return number.reshape(held.shape)[partner]
+    numbers = tuple((x.shape, x.dtype.str, x.tobytes()) for x in map(np.asarray, given))
+    return cloud.kept((scheme, conditions, pairs, numbers), place)
 
 
 def suited_depth(method: str, rec: Recursion, flat: bool, sourced: bool) -> int:

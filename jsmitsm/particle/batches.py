@@ -43,7 +43,7 @@ _EFFORT = (
 )
 # Up to so many Taylor coefficients, or so many where all share an elimination, one kernel is faster than many and
 # a library's matrix products.
-_SMALL, _SMALL_SHARED = 32, 45
+_SMALL, _SMALL_SHARED = 32, 66
 
 # How often the local phase was compiled; read by the tests.
 TRACES = {"rows": 0, "coefficients": 0}
