@@ -17,7 +17,7 @@ from jsmitsm.equation.branches import Branches
 from jsmitsm.equation.jumps import jumps
 from jsmitsm.equation.linearizing import Record
 from jsmitsm.equation.record_form import Form, is_fixed
-from jsmitsm.runtime.compiled import fingerprint, kept
+from jsmitsm.runtime.compiled import Same, fingerprint, kept, remembered
 from jsmitsm.runtime.jaxprs import EVERYTHING, NOTHING, inner_jaxprs, levels
 from jsmitsm.runtime.tracers import any_number, frozen, is_traced
 from jsmitsm.runtime.whole_program import in_one_program
@@ -27,6 +27,8 @@ from jsmitsm.taylor.series import Ring, full_series, variable
 
 # Particles interpreted at a time on the host: the temporaries stay in cache.  Fewer where arrays are wide.
 CHUNK = 4096
+# Numbers up to which what a record is evaluated on is compared with what it was before.
+REMEMBERED = 6000
 # How many programs were traced for compilation since import; tests watch it.
 COMPILATIONS = 0
 # Operations on floats whose value or slope may jump; look-ups in tables are among them.
@@ -103,9 +105,23 @@ class Traced:
         inputs = self._inputs(points, degree, extras, params, slots)
         if not self.linear:
             return self._compute(inputs, degree, True, True)
+        given = None if slots is not None else self._given(inputs)
+        if given is None:
+            return self._linear(inputs, degree)
+        made = lambda: jax.tree.map(frozen, self._linear(inputs, degree))  # noqa: E731
+        return remembered((Same(self), degree, given), made)
+
+    def _given(self, inputs: _Inputs) -> Any:
+        """What a linear record is evaluated on, by its numbers; None where that is much, or traced."""
+        some = [inputs.points, *inputs.extras, *inputs.leaves]
+        if is_traced(some, inputs.consts) or sum(np.size(x) for x in some) > REMEMBERED:
+            return None
+        return tuple((x.shape, x.dtype.str, x.tobytes()) for x in map(np.asarray, some))
+
+    def _linear(self, inputs: _Inputs, degree: int) -> tuple[Any, Any]:
         # Apart: a coefficient that rests on nothing traced stays on the host.
         jac = self._one_for_all(inputs) if self.constant else self._compute(inputs, degree, True, False)[0]
-        if self.source == "zero" and slots is None:
+        if self.source == "zero" and inputs.slots is None:
             return jac, None
         return jac, self._compute(inputs, degree, False, True)[1]
 
