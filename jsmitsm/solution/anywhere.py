@@ -179,7 +179,7 @@ class Anywhere:
         xp = jnp if is_traced(values, inside) else np
         values = values if inside is None else xp.where(inside[:, None], values, xp.nan)
         values = values[:, 0] if self._recipe.fields == 1 else values
-        return jnp.asarray(values)
+        return jax.device_put(values) if xp is np else values
 
     def integral(self, group: str | None = None) -> jax.Array:
         """The integral of u over a boundary group, or without a name over the domain.
