@@ -245,7 +245,7 @@ def _with(values: Sequence[Any], places: Sequence[int], new: Sequence[Any]) -> l
 @lru_cache(maxsize=_KEPT)
 def _whole(
     function: Callable[..., Any], static: tuple[tuple[str, Any], ...], tree: Any, options: Options, small: bool,
-    by_row: tuple[bool | str, ...] | None,
+    by_row: tuple[bool | str, ...] | None = None,
 ) -> Program:  # fmt: skip
     """A function of the leaves of its arguments."""
     call = lambda *leaves: function(**dict(static), **jax.tree.unflatten(tree, leaves))  # noqa: E731
