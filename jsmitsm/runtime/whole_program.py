@@ -324,8 +324,7 @@ def _impl(*arguments: Any, program: Program) -> list[Any]:
     out = jax.tree.leaves(program.run(*arguments))
     if program.on_host:
         avals = program.result(_avals(arguments)).avals
-        # jnp.asarray would compile a program for every shape.
-        return [jax.device_put(np.asarray(x, a.dtype)) for x, a in zip(out, avals, strict=True)]
+        return [jnp.asarray(np.asarray(x, a.dtype)) for x, a in zip(out, avals, strict=True)]
     return out
 
 
