@@ -18,7 +18,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.linalg import block_diag
 
 from jsmitsm.particle import batches, moments
 from jsmitsm.particle.elimination import Elimination, Scheme, eliminate
@@ -141,6 +140,8 @@ def _each(sides: tuple[Side, ...]) -> Any:
 
 
 def _joint(scheme: JointScheme, points: Any, sides: tuple[Side, ...], each: Any, coef: Any) -> _Joint:
+    from jax.scipy.linalg import block_diag  # takes a hundredth of a second, which only regions need
+
     near = [
         moments.support(at, ids, neighbours, None, s.decay)
         for s, at, (ids, neighbours, *_) in zip(scheme.sides, points, each)
