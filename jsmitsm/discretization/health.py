@@ -62,9 +62,9 @@ def _worst(row: Row) -> tuple[np.ndarray, np.ndarray]:
 def repaired(
     disc: Discretization, nums: Numbers, classes: list[Class], rows: list[Row]
 ) -> tuple[list[Class], list[Row], Health]:
-    """Give weak particles wider stencils, then balanced ones; keep the healthiest found.
+    """Give weak particles wider weights, wider stencils, then balanced ones; keep the healthiest found.
 
-    Tried in turn until L <= 1.5: 1.5 and 2.2 times the neighbours, then stencils with some
+    Tried in turn until L <= 1.5: a weight that falls less, 1.5 and 2.2 times the neighbours, then stencils with some
     neighbours from every direction. Particles with conditions of their own take no half measures.
     """
     new_classes, new_rows, touched = [], [], [np.zeros(0, int)]
@@ -100,8 +100,14 @@ def _repaired(
     classes, rows = zip(*poor)
     scheme, ids = classes[0].scheme, np.concatenate([cls.ids for cls in classes])
     near = np.concatenate([cls.neighbours for cls in classes])
-    best = _Best(Row(*map(np.concatenate, zip(*rows))), near, bool(scheme.n_own))
+    row = Row(*map(np.concatenate, zip(*rows)))
     width = min(len(points), round(2.2 * size))
+    even = replace(scheme, uneven=not scheme.n_own)
+    if even.decay != scheme.decay:
+        scheme = even
+        wide = _widened(near, rounded_width(width, 16), 1, -1)
+        row = _narrow_row(class_rows(disc, nums, Class(ids, wide, scheme), shared), near.shape[1])
+    best = _Best(row, near, bool(scheme.n_own))
     for attempt in (wider(1.5), wider(2.2), balanced(1.0), balanced(1.5), balanced(2.2)):
         left = np.flatnonzero(best.lebesgue > LEBESGUE)
         if not len(left):
@@ -192,6 +198,10 @@ def _some(cls: Class, at: np.ndarray) -> Class:
 
 def _take(row: Row, at: np.ndarray) -> Row:
     return Row(*(np.asarray(x)[at] for x in row))
+
+
+def _narrow_row(row: Row, width: int) -> Row:
+    return row._replace(weights=np.asarray(row.weights)[:, :, :width], data=np.asarray(row.data)[:, :, :width])
 
 
 def _wide_row(row: Row, width: int) -> Row:
