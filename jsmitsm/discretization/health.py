@@ -62,10 +62,11 @@ def _worst(row: Row) -> tuple[np.ndarray, np.ndarray]:
 def repaired(
     disc: Discretization, nums: Numbers, classes: list[Class], rows: list[Row]
 ) -> tuple[list[Class], list[Row], Health]:
-    """Give weak particles wider weights, wider stencils, then balanced ones; keep the healthiest found.
+    """Give weak particles wider stencils, then balanced ones; keep the healthiest found.
 
-    Tried in turn until L <= 1.5: a weight that falls less, 1.5 and 2.2 times the neighbours, then stencils with some
-    neighbours from every direction. Particles with conditions of their own take no half measures.
+    Tried in turn until L <= 1.5: 1.5 and 2.2 times the neighbours, then stencils with some neighbours from every
+    direction. Those that stay weak are tried again with a weight that falls less. Particles with conditions of their
+    own take no half measures.
     """
     new_classes, new_rows, touched = [], [], [np.zeros(0, int)]
     # The pieces of a class are repaired together.
@@ -83,12 +84,27 @@ def repaired(
         poor = [(_some(cls, at), _take(row, at)) for cls, row, at in found if len(at)]
         if poor:
             size = max(int((cls.neighbours >= 0).sum(axis=1).max()) for cls, *_ in found)
-            cls, row, changed = _repaired(disc, nums, poor, size)
-            new_classes.append(cls)
-            new_rows.append(row)
-            touched.append(changed)
+            for cls, row, changed in _parted(disc, nums, *_repaired(disc, nums, poor, size), size):
+                new_classes.append(cls)
+                new_rows.append(row)
+                touched.append(changed)
     after = examine(new_classes, new_rows)
     return new_classes, new_rows, replace(after, repaired=np.concatenate(touched))
+
+
+def _parted(
+    disc: Discretization, nums: Numbers, cls: Class, row: Row, changed: np.ndarray, size: int
+) -> list[tuple[Class, Row, np.ndarray]]:
+    """Repaired particles, and apart from them those that stay weak, with a weight that falls less where that helps."""
+    even, weak = replace(cls.scheme, uneven=True), _score(row) > LEBESGUE
+    if cls.scheme.n_own or even.decay == cls.scheme.decay or not weak.any():
+        return [(cls, row, changed)]
+    poor = replace(_some(cls, weak), scheme=even)
+    start = class_rows(disc, nums, poor, shared_elimination(disc, nums))
+    soft = _repaired(disc, nums, [(poor, start)], size)
+    rest = _some(cls, ~weak)
+    sound = [(rest, _take(row, ~weak), np.intersect1d(changed, rest.ids))] if len(rest.ids) else []
+    return [*sound, (soft[0], soft[1], np.union1d(soft[2], np.intersect1d(changed, poor.ids)))]
 
 
 def _repaired(
@@ -100,14 +116,8 @@ def _repaired(
     classes, rows = zip(*poor)
     scheme, ids = classes[0].scheme, np.concatenate([cls.ids for cls in classes])
     near = np.concatenate([cls.neighbours for cls in classes])
-    row = Row(*map(np.concatenate, zip(*rows)))
+    best = _Best(Row(*map(np.concatenate, zip(*rows))), near, bool(scheme.n_own))
     width = min(len(points), round(2.2 * size))
-    even = replace(scheme, uneven=not scheme.n_own)
-    if even.decay != scheme.decay:
-        scheme = even
-        wide = _widened(near, rounded_width(width, 16), 1, -1)
-        row = _narrow_row(class_rows(disc, nums, Class(ids, wide, scheme), shared), near.shape[1])
-    best = _Best(row, near, bool(scheme.n_own))
     for attempt in (wider(1.5), wider(2.2), balanced(1.0), balanced(1.5), balanced(2.2)):
         left = np.flatnonzero(best.lebesgue > LEBESGUE)
         if not len(left):
@@ -198,10 +208,6 @@ def _some(cls: Class, at: np.ndarray) -> Class:
 
 def _take(row: Row, at: np.ndarray) -> Row:
     return Row(*(np.asarray(x)[at] for x in row))
-
-
-def _narrow_row(row: Row, width: int) -> Row:
-    return row._replace(weights=np.asarray(row.weights)[:, :, :width], data=np.asarray(row.data)[:, :, :width])
 
 
 def _wide_row(row: Row, width: int) -> Row:
