@@ -23,6 +23,8 @@ LEBESGUE = 1.5
 # A particle with conditions of its own (a Neumann side) is one-sided by nature: short of a healthy
 # stencil a wider one costs it more accuracy than it gains, unless the old one is as bad as this.
 HOPELESS = 10.0
+# Beyond this a stencil that could not be repaired has a weight that falls less.
+POOR = 3.0
 # A moment system that misses what is asked of it by more than this does not determine it.
 DEFECT = 1e-6
 
@@ -65,7 +67,7 @@ def repaired(
     """Give weak particles wider stencils, then balanced ones; keep the healthiest found.
 
     Tried in turn until L <= 1.5: 1.5 and 2.2 times the neighbours, then stencils with some neighbours from every
-    direction. Those that stay weak are tried again with a weight that falls less. Particles with conditions of their
+    direction. Those that stay poor are tried again with a weight that falls less. Particles with conditions of their
     own take no half measures.
     """
     new_classes, new_rows, touched = [], [], [np.zeros(0, int)]
@@ -95,8 +97,8 @@ def repaired(
 def _parted(
     disc: Discretization, nums: Numbers, cls: Class, row: Row, changed: np.ndarray, size: int
 ) -> list[tuple[Class, Row, np.ndarray]]:
-    """Repaired particles, and apart from them those that stay weak, with a weight that falls less where that helps."""
-    even, weak = replace(cls.scheme, uneven=True), _score(row) > LEBESGUE
+    """Repaired particles, and apart from them those that stay poor, with a weight that falls less."""
+    even, weak = replace(cls.scheme, uneven=True), _score(row) > POOR
     if cls.scheme.n_own or even.decay == cls.scheme.decay or not weak.any():
         return [(cls, row, changed)]
     poor = replace(_some(cls, weak), scheme=even)

@@ -200,7 +200,7 @@ def _gathered(rec: Recursion, scaled: Any) -> Any:
 @_gathered.defjvp
 def _gathered_jvp(rec: Recursion, primals: Any, tangents: Any) -> tuple[Any, Any]:
     # A scatter is what transposes to a gather.
-    return _gathered(rec, *primals), _scattered(rec, *tangents, jnp)
+    return _gathered(rec, *primals), _scattered(rec, tangents[0], jnp)
 
 
 @lru_cache(maxsize=64)
