@@ -12,8 +12,8 @@ from jsmitsm.particle.recursion import Recursion
 from jsmitsm.runtime.tracers import concrete, is_traced
 
 # The highest degree of local polynomials where information travels, and where convection outweighs diffusion between
-# neighbours by the third: measured, degree 12 leaves errors of 1e-5 there, and 1e-6 in their estimates. Beyond the fourth
-# two degrees have all of the gain.
+# neighbours by the third number: measured, degree 12 leaves errors of 1e-5 there, and 1e-6 in their estimates. Beyond
+# the fourth two degrees have all of the gain.
 TRAVELLING, CARRIED, PECLET, STRONG = 10, 8, 5.0, 50.0
 # Particles whose coefficients are looked at.
 _LOOKED_AT = 64
