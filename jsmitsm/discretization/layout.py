@@ -14,6 +14,7 @@ from jsmitsm.cloud.neighbours import Stencils
 from jsmitsm.cloud.regions.region_cloud import RegionCloud
 from jsmitsm.cloud.walls import Walls, seen
 from jsmitsm.discretization.periodic import Images, periodic_images, with_corners
+from jsmitsm.discretization.resolution.digits import room
 from jsmitsm.discretization.supports import check_supports, cut_off, default_kernel, find_stencils, walls_of
 from jsmitsm.equation.branches import FIELD
 from jsmitsm.equation.closing import closed
@@ -127,6 +128,7 @@ def discretize(
     flat = traced.constant and rec.scale_free
     if depth == "auto":
         depth = suited_depth(method, rec, flat, sourced)
+        depth = depth and min(depth, room(rec, order, traced, cloud, problem.params))
     rec = recursion(cloud.dim, order, problem.fields, traced.slots, traced.pattern, traced.order, int(depth))
     groups = group_conditions(problem, with_corners(problem, cloud), order, traced.order)
     scheme = _scheme(method, rec, traced, problem, cloud, basis_terms)

@@ -25,10 +25,10 @@ from jsmitsm.taylor.jets import evaluate, plain
 from jsmitsm.taylor.multi_indices import Slot, count
 from jsmitsm.taylor.series import Ring, full_series, variable
 
-# Particles interpreted at a time on the host: the temporaries stay in cache.  Fewer where arrays are wide.
-CHUNK = 4096
 # Numbers up to which what a record is evaluated on is compared with what it was before.
 REMEMBERED = 6000
+# Numbers of a series interpreted at a time on the host, but always so many particles: the temporaries stay in cache.
+CHUNK, LEAST = 60_000, 512
 # How many programs were traced for compilation since import; tests watch it.
 COMPILATIONS = 0
 # Operations on floats whose value or slope may jump; look-ups in tables are among them.
@@ -204,7 +204,7 @@ class Traced:
     def _on_host(self, inputs: _Inputs, degree: int, jac: bool, res: bool) -> tuple[Any, Any]:
         """In numpy, some particles at a time."""
         n = len(inputs.points)
-        size = max(CHUNK // self._width, CHUNK // 8, 1)
+        size = max(CHUNK // (self._width * count(self.dim, degree)), LEAST)
         parts = [self._series(inputs.chunk(low, size), degree, jac, res) for low in range(0, max(n, 1), size)]
         if len(parts) == 1:
             return parts[0]

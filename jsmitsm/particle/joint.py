@@ -152,7 +152,7 @@ def _joint(scheme: JointScheme, points: Any, sides: tuple[Side, ...], each: Any,
     made = [_solved(s, side, e[2], length) for s, side, e in zip(scheme.sides, sides, each)]
     rows, scale = _conditions(scheme, coef, [e[3] for e in each], length, root)
     basis = block_diag(*(m.basis for m in made))
-    particular = block_diag(*(r * m.particular for r, m in zip(root, made)))
+    particular = block_diag(*(r * (m.particular @ jnp.eye(len(m.lift))) for r, m in zip(root, made)))
     z, solve = null_space(rows @ basis)
     reduced = basis @ z
     values = block_diag(*(_values(s, n) for s, n in zip(scheme.sides, near)))

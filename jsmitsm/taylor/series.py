@@ -109,12 +109,30 @@ def mul(ring: Ring, x: Array, y: Array) -> Array:
             return out
         shape = np.broadcast_shapes(x.shape[1:], y.shape[1:])
         out = np.zeros((count(ring.dim, degree), *shape), np.result_type(x, y))
-        rows = product_rows(ring.dim, left, right, degree)
-        for a in np.flatnonzero(x.reshape(len(x), -1).any(axis=1)):
+        ours, theirs = _filled_rows(x), _filled_rows(y)
+        if len(ours) > len(theirs):
+            x, y, left, right, ours, theirs = y, x, right, left, theirs, ours
+        rows, sparse = product_rows(ring.dim, left, right, degree), 2 * len(theirs) < len(y)
+        for a in ours:
             n, places = rows[a]
-            if n:
+            if n and sparse:
+                some = theirs[: np.searchsorted(theirs, n)]
+                at = some + places.start if isinstance(places, slice) else places[some]
+                out[at] += x[a] * y[some]
+            elif n:
                 out[places] += x[a] * y[:n]
     return out
+
+
+def _filled_rows(x: np.ndarray) -> np.ndarray:
+    """The coefficients that do not vanish: few of a function of one coordinate alone."""
+    flat = x.reshape(len(x), -1)
+    filled = flat[:, 0] != 0
+    if filled.all():
+        return np.arange(len(x))
+    for k in np.flatnonzero(~filled):
+        filled[k] = flat[k].any()
+    return np.flatnonzero(filled)
 
 
 def block(ring: Ring, x: Array, degree: int) -> Array:
