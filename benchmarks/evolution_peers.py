@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jsmitsm.evolution.space.matrices import Sparse
+from jsmitsm.discretization.pencil.sparse import Sparse
 from jsmitsm.evolution.space.system import System
 from jsmitsm.evolution.steps.stepping import Stepper
 from jsmitsm.evolution.steps.tableaux import KENCARP4
