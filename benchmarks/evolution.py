@@ -135,7 +135,7 @@ def random(quick: bool) -> Iterator[Line]:
         for steps in (10, 100, 1000):
             found = heated("heat on random particles", cloud, order=order, steps=steps, scheme="esdirk")
             first = first or found["error"]
-            yield found | {"wanted": 1.05 * first}
+            yield found | {"wanted": 1.1 * first}
 
 
 def impulse(quick: bool) -> Iterator[Line]:
@@ -218,6 +218,29 @@ def grayscott(quick: bool) -> Iterator[Line]:
             yield line("Gray-Scott, py-pde", 2, 2 * n * n, found[2], found[0], found[1])
 
 
+def taylorgreen(quick: bool) -> Iterator[Line]:
+    """Stream function and vorticity between walls that slip; the error is that of the velocity."""
+    nu, end = 0.1, 1.0
+
+    def pde(u: Any, x: Any, t: Any) -> Any:
+        g, h, lap = js.grad(u[0])(x), js.grad(u[1])(x), js.laplacian(u)(x)
+        return jnp.stack([lap[0] + u(x)[1], js.dt(u[1])(x) + g[1] * h[0] - g[0] * h[1] - nu * lap[1]])
+
+    def stream(x: Any, t: Any) -> Any:
+        return jnp.sin(x[0]) * jnp.sin(x[1]) * jnp.exp(-2 * nu * t)
+
+    cloud = square(21, 0.0, np.pi)
+    problem = js.Problem(pde, everywhere(cloud, js.dirichlet(0.0)), fields=2)
+    began = time.perf_counter()
+    run = js.evolve(problem, cloud, lambda x: jnp.stack([stream(x, 0.0), 2 * stream(x, 0.0)]), (0.0, end), steps=20,
+                    order=6, progress=False)  # fmt: skip
+    spent = time.perf_counter() - began
+    found = np.asarray(run.at(end).grad(cloud.points))[:, 0]
+    exact = values(jax.grad(stream), cloud, end)
+    yield line("Taylor-Green vortex, velocity", 6, run.stats["unknowns"], 20, np.abs(found - exact).max(), spent, 1e-5,
+               scheme=run.stats["scheme"], flags=list(run.flags))  # fmt: skip
+
+
 # --------------------------------------------------------------------------------------- cost
 
 
@@ -278,7 +301,8 @@ def large(quick: bool) -> Iterator[Line]:
 
 CASES: dict[str, Callable[[bool], Iterator[Line]]] = {
     "heat": heat, "orders": orders, "random": random, "impulse": impulse, "front": front, "burgers": burgers,
-    "wave": wave, "grayscott": grayscott, "cost": cost, "gradient": gradient, "large": large,
+    "wave": wave, "grayscott": grayscott, "taylorgreen": taylorgreen, "cost": cost, "gradient": gradient,
+    "large": large,
 }  # fmt: skip
 
 

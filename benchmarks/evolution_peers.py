@@ -150,7 +150,8 @@ def differences(start: Callable[[Any], Any], spread: Any, feed: float, kill: flo
         "b": f"{spread[1]} * laplace(b) + a * b**2 - {feed + kill} * b",
     })  # fmt: skip
     began = time.perf_counter()
-    found, told = rhs.solve(state, end, dt=0.1, adaptive=True, tolerance=1e-6, tracker=None, ret_info=True)
+    found, told = rhs.solve(state, end, dt=0.1, solver="runge-kutta", adaptive=True, tolerance=1e-5, tracker=None,
+                            ret_info=True)  # fmt: skip
     spent = time.perf_counter() - began
     error = np.abs(np.stack([f.data.reshape(-1) for f in found], axis=1) - exact(centres)).max()
     return float(error), spent, int(told["solver"]["steps"])

@@ -124,6 +124,7 @@ def _classified(
         source = "zero"
     else:
         source = "variable" if _bits(rest) & (POINT | EXTRAS) else "constant"
+    written = r.written, r.consts[len(r.consts) - len(r.written.constvars) :]
     return Traced(
         dim=dim,
         fields=fields,
@@ -135,7 +136,7 @@ def _classified(
         constant=linear and not every & (POINT | EXTRAS),
         source=source,
         uses_extras=bool((every | _bits(facts[0])) & EXTRAS),
-        branches=None if affine else branches(r.written, r.consts[len(r.consts) - len(r.written.constvars) :], n_extras),
+        branches=None if affine else branches(*written, n_extras),
         _record=r,
         _n_extras=n_extras,
         _params_tree=params_tree,

@@ -23,7 +23,8 @@ def estimated(
 ) -> np.ndarray:
     """Estimated errors (S, N, F): |w - u| of A' w = B' f + Bg' g, f = -(M u' + N), and in_time (S,), what steps add.
 
-    history: times and values of the steps; rates: their rates, of second order. Dashes are of order p + 2. What the rates leave over drives the error, from zero at the start.
+    Dashes are of order p + 2. What the rates leave over drives the error, from zero at the start. history: times and
+    values of the steps; rates: theirs, of second order in time.
     """
     semi, (steps, values) = run.semi, history
     out = np.zeros((len(times), semi.n, semi.fields))

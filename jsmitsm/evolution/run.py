@@ -125,7 +125,8 @@ class Run:
             rec = pencil.layout.disc.rec
             slots = slot_series(rec, timed.space.slots, taylor, 0)
             jac, _ = timed.space.coefficients(self.cloud.points, 0, params=problem.params, slots=slots)
-            reference = (jnp if is_traced(jac) else np).broadcast_to(jac[:, :, 0], (self.fields, len(timed.space.slots), len(self.cloud)))
+            xp = jnp if is_traced(jac) else np
+            reference = xp.broadcast_to(jac[:, :, 0], (self.fields, len(timed.space.slots), len(self.cloud)))
         semi = Semidiscrete(timed, pencil, self.params, self.damping, reference)
         if not self.traced:
             refuse_convection(semi, self.flags)

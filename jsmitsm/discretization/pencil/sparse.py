@@ -12,9 +12,10 @@ import numpy as np
 
 from jsmitsm.runtime.collector import uncollected
 from jsmitsm.runtime.tracers import is_traced
+from jsmitsm.runtime.whole_program import picked
 
 # Entries that are taken together, few enough to stay in cache.
-CHUNK = 1024
+CHUNK = 256
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=["values", "rows", "cols"], meta_fields=["shape"])
@@ -58,7 +59,8 @@ class Sparse:
         place[0][rows], place[1][cols] = np.arange(len(rows)), np.arange(len(cols))
         keep = np.flatnonzero((place[0][self.rows] >= 0) & (place[1][self.cols] >= 0))
         at = place[0][self.rows[keep]], place[1][self.cols[keep]]
-        return Sparse(self.values[keep], *at, (len(rows), len(cols)))
+        values = picked(self.values, keep) if is_traced(self.values) else self.values[keep]
+        return Sparse(values, *at, (len(rows), len(cols)))
 
 
 def _times(values: Any, rows: Any, cols: Any, x: Any, n: int) -> Any:

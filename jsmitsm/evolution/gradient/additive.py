@@ -97,7 +97,8 @@ def scanned(scheme: Additive, semi: Semidiscrete, steps: int, given: Inputs) -> 
     resolvent = system.resolvent(given.h * g)
 
     def step(y: Any, window: Any) -> tuple[Any, Any]:
-        force, jump, known, times = (jnp.asarray(v)[window] for v in (given.force, given.jump, given.known, given.times))
+        whole = given.force, given.jump, given.known, given.times
+        force, jump, known, times = (jnp.asarray(v)[window] for v in whole)
         base, ps, qs, last = system.mass(y) + jump[0], [], [], y
         for i in range(1, s + 1):
             ps.append(jnp.where(still, 0.0, force[i - 1] - system.stiff(last)))

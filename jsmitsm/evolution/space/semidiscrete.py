@@ -13,8 +13,8 @@ import numpy as np
 from jsmitsm.discretization.coefficients import conditions_of
 from jsmitsm.discretization.pencil.assemble import Pencil
 from jsmitsm.discretization.pencil.local import source_stencils
-from jsmitsm.evolution.space.local_fits import LocalFits
 from jsmitsm.discretization.pencil.sparse import Sparse
+from jsmitsm.evolution.space.local_fits import LocalFits
 from jsmitsm.evolution.space.system import System
 from jsmitsm.evolution.space.timed import Timed
 from jsmitsm.evolution.steps.tableaux import Sampling
