@@ -196,7 +196,7 @@ def spot(x: Any) -> Any:
     return jnp.stack([1.0 - 0.5 * bump, 0.25 * bump])
 
 
-def grayscott(quick: bool) -> Iterator[Line]:
+def gray_scott() -> js.Problem:
     def pde(u: Any, x: Any, t: Any) -> Any:
         a, b = u(x)
         lap = js.laplacian(u)(x)
@@ -204,13 +204,15 @@ def grayscott(quick: bool) -> Iterator[Line]:
             [SPREAD[0] * lap[0] - a * b * b + FEED * (1 - a), SPREAD[1] * lap[1] + a * b * b - (FEED + KILL) * b]
         )
 
+    return js.Problem(pde, {"left": js.periodic("left", "right"), "bottom": js.periodic("bottom", "top")}, fields=2)
+
+
+def grayscott(quick: bool) -> Iterator[Line]:
     exact = peers.spectral(spot, SPREAD, FEED, KILL, LONG)
     for n in (33,) if quick else (33, 49):
         cloud = js.rectangle((0, 0), (1, 1), (n, n), jitter=0.2)
-        problem = js.Problem(pde, {"left": js.periodic("left", "right"), "bottom": js.periodic("bottom", "top")},
-                             fields=2)  # fmt: skip
         for order in (4, 6):
-            yield evolved("Gray-Scott", problem, cloud, spot, (0.0, LONG), exact(np.asarray(cloud.points)),
+            yield evolved("Gray-Scott", gray_scott(), cloud, spot, (0.0, LONG), exact(np.asarray(cloud.points)),
                           1e-4 if (n, order) == (49, 6) else None, order=order, steps=120)  # fmt: skip
     for n in (32,) if quick else (32, 64, 128):
         found = peers.differences(spot, SPREAD, FEED, KILL, LONG, n, exact)

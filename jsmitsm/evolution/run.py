@@ -20,6 +20,7 @@ from jsmitsm.evolution.space.timed import Timed
 from jsmitsm.evolution.steps.newton import Newton
 from jsmitsm.evolution.steps.stepping import RadauStepper, Stepper
 from jsmitsm.evolution.steps.tableaux import EULER, KENCARP4, RADAU, Additive, Radau
+from jsmitsm.runtime.errors import is_number
 from jsmitsm.runtime.tracers import is_traced
 
 # A quasilinear problem is linearised anew where its coefficients have changed by this part of themselves.
@@ -95,8 +96,7 @@ class Run:
             else:
                 alpha = 0.2 if coupled and max(operator.order) >= 2 and not self.algebraic else 0.0
         else:
-            good = isinstance(asked, (int, float, np.number)) and not isinstance(asked, bool)
-            if not good or not 0 <= float(asked) < np.inf:
+            if not is_number(asked) or asked < 0:
                 raise ValueError(f'damping: expected "auto" or a number from 0, got {asked!r}')
             alpha = float(asked)
         if not alpha or is_traced(self.cloud.points):
