@@ -141,7 +141,7 @@ class Run:
             self._fits = local_fits(disc, disc.rec.reach)
         return self._fits.coefficients(u)
 
-    def renew(self, y: Any, t: float) -> None:
+    def renew(self, y: Any, t: Any) -> None:
         """The pencil linearised at a later state."""
         t = t if is_traced(t) else np.asarray(float(t))
         self.semi = self.pencil(t, self.semi.lifted(y, t))
@@ -149,7 +149,9 @@ class Run:
     @property
     def scheme(self) -> Additive | Radau:
         """The coefficients of its scheme."""
-        return {"radau": RADAU, "euler": EULER}.get(self.name, KENCARP4)
+        if self.name == "radau":
+            return RADAU
+        return EULER if self.name == "euler" else KENCARP4
 
     def stepper(self, semi: Semidiscrete) -> Any:
         """What makes its steps."""

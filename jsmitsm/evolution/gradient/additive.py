@@ -41,7 +41,7 @@ def back(
     for i in range(s, 0, -1):
         number = first + i
         slope = p_bar[i]
-        if newton is None:
+        if newton is None or pull is None:
             low = system.resolvent(h * g).solve_transposed(stage_bar)
         else:
             low = newton.transposed(stage_bar, ys[i], at.times[number], h * g, at.known[number], pull, number)

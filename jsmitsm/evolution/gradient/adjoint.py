@@ -96,7 +96,7 @@ def _recorded(plan: Plan, given: Inputs) -> Any:
             "scheme: Newton's method for the stages of a run is done by the host, which neither jax.jit nor jax.vmap "
             'can wait for; call jax.grad without them, or use scheme="imex" where only lower derivatives are nonlinear'
         )
-    if given.push is not None:
+    if given.push is not None and isinstance(plan.scheme, Additive):
         return additive.scanned(plan.scheme, plan.semi, plan.steps, given)
     still = Plan(plan.semi, plan.scheme, False, plan.steps, plan.timed, False)
     shape = jax.ShapeDtypeStruct((plan.steps + 1, plan.semi.system.size), float)
@@ -115,7 +115,7 @@ def _forward_rule(plan: Plan, given: Inputs) -> tuple[Any, Any]:
         out, tape = _forward(plan, given)
         return out, _Tape(plan, given, out, *tape)
     if given.push is not None and not plan.newton:
-        return jax.vjp(lambda g: additive.scanned(plan.scheme, plan.semi, plan.steps, g), given)
+        return jax.vjp(lambda g: _recorded(plan, g), given)
     return _recorded(plan, given), given
 
 

@@ -46,12 +46,13 @@ def differentiable(run: Run, steps: int, parts: np.ndarray) -> Evolution:
         done, y, fresh = done + made, out[-1], True
         if done < steps:
             run.renew(y, t0 + h * done)
-    saved = _saved(run.semi, parts, steps, m, jnp.concatenate(found), [jnp.concatenate(v, axis=1) for v in zip(*known)])
+    samples = [jnp.concatenate(v, axis=1) for v in zip(*known)]
+    u, rates = _saved(run.semi, parts, steps, m, jnp.concatenate(found), samples)
     recipe = Recipe("S", run.order, None, "loo", run.fields, min(2, HIGHEST - run.order))
-    finite = jnp.isfinite(saved[0]).all()
+    finite = jnp.isfinite(u).all()
     good = finite if is_traced(finite) else bool(finite)
     stats = {"scheme": "Radau IIA 5" if isinstance(scheme, Radau) else scheme.name, "steps": steps}
-    return Evolution(t0 + (t1 - t0) * parts, *saved, run.cloud, recipe, good, stats)
+    return Evolution(t0 + (t1 - t0) * parts, u, rates, run.cloud, recipe, good, stats)
 
 
 def _inputs(
