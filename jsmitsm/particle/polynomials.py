@@ -107,19 +107,23 @@ def derivative_table(dim: int, order: int, b: tuple[int, ...]) -> tuple[np.ndarr
     )
 
 
-def functionals(slots: Sequence[Slot], coef: Any, p: Any, rec: Recursion, length: Any) -> tuple[Any, Any]:
+def functionals(
+    slots: Sequence[Slot], coef: Any, p: Any, rec: Recursion, length: Any, units: Any
+) -> tuple[Any, Any]:
     """Rows (n, F K) of conditions sum_s coef[n, s] d^b u_f at a point with monomials p (K,).
 
-    Each row is scaled to be free of units and of unit size at the leading term; the second
+    units (F,): of the fields. Each row is scaled to be free of units and of unit size at the leading term; the second
     result holds the factors (n,) of the right-hand side.
     """
     rows = jnp.zeros((coef.shape[0], rec.fields * rec.size), p.dtype)
     for s, (f, b) in enumerate(slots):
         lower, factor = derivative_table(rec.dim, rec.reach, b)
-        row = p[lower] * factor * length ** (-sum(b) - rec.weights[f])
+        row = p[lower] * factor * units[f] * length ** (-sum(b) - rec.weights[f])
         rows = rows.at[:, f * rec.size : (f + 1) * rec.size].add(coef[:, s, None] * row)
-    sizes = jnp.stack([jnp.abs(coef[:, s]) * length ** (-sum(b) - rec.weights[f]) for s, (f, b) in enumerate(slots)])
-    size = jnp.max(sizes, axis=0)
+    sizes = [
+        jnp.abs(coef[:, s]) * units[f] * length ** (-sum(b) - rec.weights[f]) for s, (f, b) in enumerate(slots)
+    ]
+    size = jnp.max(jnp.stack(sizes), axis=0)
     scale = 1.0 / jnp.where(size > 0, size, 1.0)
     return rows * scale[:, None], scale
 
