@@ -86,6 +86,7 @@ class Cloud:
     """
 
     cell_groups = Groups({})  # also of clouds pickled before there were any
+    _shape: Any = None  # what the particles fill, where their maker knows it: pictures end there
 
     def __init__(
         self,
@@ -107,7 +108,8 @@ class Cloud:
         object.__setattr__(self, name, value)
 
     def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in self.__dict__.items() if name != "_inside"}  # made again when needed
+        # What is made again when needed, and what pictures alone look at.
+        return {name: value for name, value in self.__dict__.items() if name not in ("_inside", "_shape")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update({name: frozen(value) for name, value in state.items()})

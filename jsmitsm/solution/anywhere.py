@@ -12,8 +12,8 @@ import numpy as np
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.cloud.quadrature import quadrature
 from jsmitsm.runtime.arrays import ArrayLike, ValueOrFunction
-from jsmitsm.runtime.tracers import frozen, is_traced
-from jsmitsm.solution.evaluation import checked_points, evaluated, in_domain, nearest_particles
+from jsmitsm.runtime.tracers import frozen, is_traced, recorded
+from jsmitsm.solution.evaluation import checked_points, evaluated, evaluated_padded, in_domain, nearest_particles
 from jsmitsm.solution.fit import Recipe
 
 
@@ -175,9 +175,13 @@ class Anywhere:
             )
         near, weight = nearest_particles(self.cloud, points, self.cloud.dim + 2 if blend else 1)
         inside = in_domain(self.cloud, points, outside)
-        values = evaluated(b, self._recipe.reach, self.cloud.points, self._taylor, points, near, weight)
-        values = values if inside is None else jnp.where(inside[:, None], values, jnp.nan)
-        return values[:, 0] if self._recipe.fields == 1 else values
+        known = not recorded() and not is_traced(self.cloud.points, self._taylor, points, near, weight, inside)
+        values = (evaluated_padded if known else evaluated)(
+            b, self._recipe.reach, self.cloud.points, self._taylor, points, near, weight
+        )
+        xp: Any = np if known else jnp
+        values = values if inside is None else xp.where(inside[:, None], values, np.nan)
+        return jnp.asarray(values[:, 0] if self._recipe.fields == 1 else values)
 
     def integral(self, group: str | None = None) -> jax.Array:
         """The integral of u over a boundary group, or without a name over the domain.

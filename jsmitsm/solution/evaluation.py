@@ -13,9 +13,12 @@ from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.cloud.inside import inside_of
 from jsmitsm.particle.polynomials import derivative_table, monomials
 from jsmitsm.runtime.errors import refuse_masked
+from jsmitsm.runtime.size_classes import cloud_size, padded_size
 from jsmitsm.runtime.tracers import is_traced
 
 OUTSIDE = ("nan", "extrapolate", "raise")
+# Clouds of more particles keep their size: a copy of their polynomials would cost more than a program.
+_PADDED = 20_000
 
 
 def in_domain(cloud: Cloud, points: Any, outside: str) -> Any:
@@ -94,3 +97,19 @@ def evaluated(b, order, centres, taylor, points, near, weight):
         p = monomials(points - centres[near[:, k]], order)[:, lower] * factor
         total = total + weight[:, k, None] * jnp.einsum("mfk,mk->mf", taylor[near[:, k]], p)
     return total
+
+
+def evaluated_padded(b: tuple[int, ...], order: int, centres: Any, taylor: Any, points: Any, near: Any, weight: Any
+                     ) -> Any:  # fmt: skip
+    """The same for known numbers, padded, so that one program serves all clouds and any number of points of a class."""
+    many, size = len(points), padded_size(len(points), steps=1)
+    if len(centres) <= _PADDED:
+        centres, taylor = (_longer(np.asarray(x), cloud_size(len(centres))) for x in (centres, taylor))
+    padded = (_longer(np.asarray(x), size) for x in (points, near, weight))
+    return np.asarray(evaluated(b, order, centres, taylor, *padded))[:many]
+
+
+def _longer(array: np.ndarray, size: int) -> np.ndarray:
+    out = np.zeros((size, *array.shape[1:]), array.dtype)
+    out[: len(array)] = array
+    return out

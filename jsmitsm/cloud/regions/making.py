@@ -384,7 +384,9 @@ def _put_together(sketch: _Sketch, inside: dict[str, np.ndarray], groups: Any) -
             normals[column[here]] = pair_normals[name][here]
             free[column[here]] = False
         index[name] = np.sort(np.concatenate(own_ones))
-    return RegionCloud(made, index, normals, members, pairs, pair_normals)
+    cloud = RegionCloud(made, index, normals, members, pairs, pair_normals)
+    cloud._shape = sketch.shapes
+    return cloud
 
 
 def _side_normals(sketch: _Sketch, name: str, places: np.ndarray) -> np.ndarray:
