@@ -74,6 +74,14 @@ def panels(given: Any, count: int, size: tuple[float, float], rows: bool = False
     return pyplot().subplots(*shape, figsize=both, layout="constrained", squeeze=False, sharex=rows)[1].ravel()
 
 
+def rows_of(given: Any, count: int, wide: int, size: tuple[float, float]) -> np.ndarray:
+    """Axes (count, wide): the given ones, or those of a new figure."""
+    if given is not None:
+        return panels(given, count * wide, size).reshape(count, wide)
+    both = (size[0] * wide, size[1] * count)
+    return pyplot().subplots(count, wide, figsize=both, layout="constrained", squeeze=False)[1]
+
+
 def padded(points: np.ndarray, dim: int) -> np.ndarray:
     """Points of a line get a second coordinate to be drawn at."""
     return np.concatenate([points, np.zeros((len(points), 1))], axis=1) if dim == 1 else points
@@ -232,7 +240,7 @@ def maps(cloud: Cloud, numbers: np.ndarray, anywhere: Callable | None, at: Mappi
     if not np.isfinite(numbers).all():
         raise ValueError("sol: has values that are not finite, and did not converge; see sol.diagnose()")
 
-    shown = [pieces(cloud, numbers, anywhere, *where) for where in _places(cloud, at)]
+    shown = [pieces(cloud, numbers, anywhere, *where) for where in places(cloud, at)]
     if log:
         low = floor(np.concatenate([one.values for some in shown for one in some]))
         shown = [[one._replace(values=np.log10(np.maximum(one.values, low))) for one in some] for some in shown]
@@ -240,7 +248,7 @@ def maps(cloud: Cloud, numbers: np.ndarray, anywhere: Callable | None, at: Mappi
     many = cloud.dim == 3
     size = (3.6, 3.4) if many else page(np.asarray(cloud.points))
     drawn = panels(given, len(shown), size)
-    for ax, some, (axis, position) in zip(drawn, shown, _places(cloud, at)):
+    for ax, some, (axis, position) in zip(drawn, shown, places(cloud, at)):
         for one in some:
             filled = painted(ax, one, bounds, "cividis" if log else "viridis")
         ax.set_aspect("equal")
@@ -250,7 +258,7 @@ def maps(cloud: Cloud, numbers: np.ndarray, anywhere: Callable | None, at: Mappi
             ax.set_title(f"{AXES[axis]} = {position:.4g}", fontsize="medium")
     if colorbar:
         bar = plt.colorbar(filled, ax=list(drawn), label=label, shrink=0.85)
-        bar.locator = MaxNLocator(7)
+        bar.locator = round_ticks()
         bar.update_ticks()
         if log:
             whole = bool(np.floor(bounds[-1]) - np.ceil(bounds[0]) >= 1)
@@ -272,6 +280,13 @@ def steps(values: np.ndarray, levels: int) -> np.ndarray:
     return np.concatenate([[lo], between[(between > lo + slack) & (between < hi - slack)], [hi]])
 
 
+def round_ticks() -> Any:
+    """Round numbers beside a colour bar, whatever it begins and ends with."""
+    from matplotlib.ticker import MaxNLocator
+
+    return MaxNLocator(7)
+
+
 def painted(ax: Any, piece: Piece, bounds: np.ndarray, cmap: str) -> Any:
     """One piece in filled contours that end where the domain does."""
     # Matplotlib leaves white what lies on the highest level.
@@ -291,7 +306,7 @@ def page(points: np.ndarray) -> tuple[float, float]:
     return wide + 1.3, wide * ratio + 0.5
 
 
-def _places(cloud: Cloud, at: Mapping[str, float] | None) -> list[tuple[int, float]]:
+def places(cloud: Cloud, at: Mapping[str, float] | None) -> list[tuple[int, float]]:
     """Axis and position of every slice; a 2D cloud is its own only one."""
     if cloud.dim == 2:
         if at is not None:
