@@ -17,7 +17,7 @@ def flow(u, x, reynolds):  # u[:2] is the velocity, u[2] the pressure
     return jnp.append(force, js.divergence(u[:2])(x))
 
 
-square = js.rectangle((0, 0), (1, 1), (23, 23))
+square = js.rectangle((0, 0), (1, 1), (17, 17))
 still = [js.dirichlet(0.0, field=k) for k in (0, 1)]
 bcs = dict.fromkeys(("left", "right", "bottom"), still)
 bcs["top"] = [

@@ -19,7 +19,8 @@ north = """63.85 64.15 64.35 64.5 64.75 64.87 65.05 65.1 65.45 65.5 65.9 66.45 6
 64.9 64.4 64.25 63.85 63.6 63.4 63.55 63.85 63.85"""
 coast = np.stack([np.array(s.split(), float) for s in (east, north)], axis=1)
 coast = (coast - [-19, 65]) * 111.2 * [np.cos(np.radians(65)), 1]
-area = abs(np.cross(coast, np.roll(coast, -1, axis=0)).sum()) / 2
+ahead = np.roll(coast, -1, axis=0)
+area = abs(coast[:, 0] @ ahead[:, 1] - coast[:, 1] @ ahead[:, 0]) / 2
 
 island = js.from_polygon(coast, 16.0)
 rain = js.Problem(

@@ -16,25 +16,26 @@ reynolds = 40.0
 rate = reynolds / 2 - (reynolds**2 / 4 + 4 * np.pi**2) ** 0.5
 
 
-def exact(x):
+def exact(x, _):
     wave, decay = 2 * jnp.pi * x[1], jnp.exp(rate * x[0])
     along = 1 - decay * jnp.cos(wave)
     return jnp.stack([along, rate / 2 / jnp.pi * decay * jnp.sin(wave)])
 
 
-def flow(u, x):
-    inertia = js.grad(u[:2])(x) @ u(x)[:2]
-    force = inertia - js.laplacian(u[:2])(x) / reynolds + js.grad(u[2])(x)
+def flow(u, x, reynolds):  # u[:2] is the velocity, u[2] the pressure
+    inertia = reynolds * js.grad(u[:2])(x) @ u(x)[:2]
+    force = inertia - js.laplacian(u[:2])(x) + js.grad(u[2])(x)
     return jnp.append(force, js.divergence(u[:2])(x))
 
 
-cloud = js.rectangle((-0.5, -0.5), (1.0, 1.5), (16, 21))
-given = [js.dirichlet(lambda x, k=k: exact(x)[k], field=k) for k in (0, 1)]
+cloud = js.rectangle((-0.5, -0.5), (1.0, 1.5), (13, 17))
+given = [js.dirichlet(lambda x, re, k=k: exact(x, re)[k], field=k) for k in (0, 1)]
 bcs = dict.fromkeys(("left", "right", "bottom", "top"), given)
-sol = js.solve(js.Problem(flow, bcs, fields=3), cloud)
+problem = js.Problem(flow, bcs, fields=3, params=reynolds)
+sol = js.solve(problem, cloud)
 
-error = abs(sol.u[:, :2] - jax.vmap(exact)(cloud.points)).max()
-assert error < 1e-2  # order 4 with ten particles a wave
+error = abs(sol.u[:, :2] - jax.vmap(exact, (0, None))(cloud.points, 0)).max()
+assert error < 2e-2  # order 4 with eight particles a wave
 
 ax = js.plot.solution(sol, field=2)
 js.plot.streamlines(sol, ax=ax)

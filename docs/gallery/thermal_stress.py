@@ -48,5 +48,5 @@ around = law(sol.grad([[1.0, 0.0]])[0, :2], 1.0)[1, 1]
 known = 2.5 / 1.5 / np.log(2) * (1 - 8 / 3 * np.log(2))  # young 2.5, poisson 1/4
 assert abs(around / known - 1) < 1e-2  # order 4, eight particles across
 
-js.plot.deformed(sol, colour=lambda x: sol(x, outside="extrapolate")[:, 2])
+js.plot.deformed(sol, colour=lambda x: sol(x, outside="extrapolate")[:, 2], label="heat")
 plt.show()

@@ -8,6 +8,7 @@ import jax
 
 jax.config.update("jax_enable_x64", True)
 import matplotlib.pyplot as plt
+import numpy as np
 import jsmitsm as js
 
 square = js.rectangle((0, 0), (1, 1), (15, 15))
@@ -19,5 +20,6 @@ sol = js.solve(bar, square, order=6)
 assert abs(2 * sol.integral() / 0.1405770 - 1) < 1e-4
 
 ax = js.plot.solution(sol)
-js.plot.streamlines(sol, of=lambda x: sol.grad(x)[:, ::-1] * [[1, -1]], ax=ax)
+shear = lambda x: sol.grad(x)[:, ::-1] * np.array([1, -1])
+js.plot.streamlines(sol, of=shear, ax=ax)
 plt.show()
