@@ -1,7 +1,7 @@
 """A cantilever
 
-Timoshenko's beam as a plane body: an exact solution of the third degree, so that
-order 4 has it to rounding. The wall moves as that solution does.
+Timoshenko's beam as a plane body: an exact solution of the third degree, so
+that order 4 has it to rounding. The wall moves as that solution does.
 """
 
 import jax

@@ -1,7 +1,8 @@
 """Flow in a cavity, without and with inertia
 
-The lid moves. Stokes' flow is symmetric; at a Reynolds number of 100 the vortex
-moves with the lid. On the middle line u is -0.2058 at half height (Ghia, 1982).
+The lid moves. Stokes' flow is symmetric; at a Reynolds number of 100 the
+vortex moves with the lid. On the middle line u is -0.2058 at half height
+(Ghia, 1982).
 """
 
 import jax

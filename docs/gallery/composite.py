@@ -1,7 +1,7 @@
 """Fibres in a matrix
 
-How well does a material conduct that holds round fibres, ten times better, in a
-square pattern? A quarter of a cell, two regions, against Rayleigh's formula
+How well does a material conduct that holds round fibres, ten times better, in
+a square pattern? A quarter of a cell, two regions, against Rayleigh's formula
 (1892).
 """
 

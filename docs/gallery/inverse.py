@@ -37,6 +37,7 @@ for _ in range(8):
 
 assert abs(guess - truth).max() < 1e-6  # Newton's method has converged
 
-js.plot.values(square, jax.vmap(lambda y: k(y, guess))(square.points), label="k")
+found = jax.vmap(lambda y: k(y, guess))(square.points)
+js.plot.values(square, found, label="k")
 plt.plot(*square.points[inside].T, "wo", markersize=4)
 plt.show()

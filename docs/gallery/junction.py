@@ -1,8 +1,8 @@
 """A p-n junction
 
-Potential across a semiconductor in balance, in units of the thermal voltage and
-the Debye length: free charges follow Boltzmann, the doping jumps. The field at
-the junction is known in closed form.
+Potential across a semiconductor in balance, in units of the thermal voltage
+and the Debye length: free charges follow Boltzmann, the doping jumps. The
+field at the junction is known in closed form.
 """
 
 import jax

@@ -27,7 +27,7 @@ def stress(g):
 hole = js.sdf.difference(js.sdf.circle((0, 0), 3.0), js.sdf.circle((0, 0), 1.0))
 plate = js.from_sdf(
     hole, ((-3, -3), (3, 3)), lambda x: 0.16 * np.hypot(*x.T),
-    groups={"hole": lambda x: np.hypot(*x.T) < 2, "far": lambda x: x[:, 0] > -9},
+    groups={"hole": lambda x: np.hypot(*x.T) < 2, "far": lambda x: x[:, 0] < 4},
 )
 force = lambda u, x, n: stress(js.grad(u)(x)) @ n
 balance = lambda u, x: js.laplacian(u)(x) + 2 * js.grad(js.divergence(u))(x)

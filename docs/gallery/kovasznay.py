@@ -29,8 +29,9 @@ def flow(u, x, reynolds):  # u[:2] is the velocity, u[2] the pressure
 
 
 cloud = js.rectangle((-0.5, -0.5), (1.0, 1.5), (13, 17))
-given = [js.dirichlet(lambda x, re, k=k: exact(x, re)[k], field=k) for k in (0, 1)]
-bcs = dict.fromkeys(("left", "right", "bottom", "top"), given)
+along = js.dirichlet(lambda x, re: exact(x, re)[0], field=0)
+across = js.dirichlet(lambda x, re: exact(x, re)[1], field=1)
+bcs = dict.fromkeys(("left", "right", "bottom", "top"), [along, across])
 problem = js.Problem(flow, bcs, fields=3, params=reynolds)
 sol = js.solve(problem, cloud)
 

@@ -22,9 +22,10 @@ def film(u, x):
 
 frame = js.rectangle((-1.2, -1.2), (1.2, 1.2), (15, 15))
 held = dict.fromkeys(("left", "right", "bottom", "top"), js.dirichlet(exact))
-sol = js.solve(js.Problem(film, held), frame, order=6)
+sol = js.solve(js.Problem(film, held), frame, order=4)
 
-assert abs(sol([[0.5, 0.8]])[0] - exact(jnp.array([0.5, 0.8]))) < 1e-4  # order 6
+place = jnp.array([0.5, 0.8])
+assert abs(sol(place[None])[0] - exact(place)) < 1e-3  # order 4
 
 ax = plt.figure(figsize=(5, 4.4)).add_subplot(projection="3d")
 ax.plot_trisurf(*frame.points.T, sol.u, cmap="viridis")

@@ -1,7 +1,7 @@
 """The best heating
 
-Which source makes a temperature as wanted, if heating costs? The conditions of an
-optimum are two equations: one for the temperature, one for its multiplier.
+Which source makes a temperature as wanted, if heating costs? The conditions of
+an optimum are two equations: one for the temperature, one for its multiplier.
 """
 
 import jax

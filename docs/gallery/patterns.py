@@ -1,8 +1,8 @@
 """Patterns that grow by themselves
 
-Schnakenberg's reaction (1979) with an inhibitor that diffuses ten times faster.
-An even state is unstable against waves; this one first grows at the rate that
-the linearised equations tell, then becomes spots.
+Schnakenberg's reaction (1979) with an inhibitor that diffuses ten times
+faster. An even state is unstable against waves; this one first grows at the
+rate that the linearised equations tell, then becomes spots.
 """
 
 import jax
@@ -26,7 +26,8 @@ wave = np.pi / 24 * np.array([3.0, 3.0])  # along x and y
 linear = np.array([[0.8, 1.0], [-1.8, -1.0]]) - np.diag(spread) * (wave @ wave)
 rates, modes = np.linalg.eig(linear)
 rate, mode = rates.real.max(), modes[:, rates.real.argmax()].real
-start = lambda x: jnp.array([1.0, 0.9]) + 1e-3 * mode * jnp.prod(jnp.cos(wave * x))
+ripple = lambda x: 1e-3 * mode * jnp.prod(jnp.cos(wave * x))
+start = lambda x: jnp.array([1.0, 0.9]) + ripple(x)
 
 dish = js.rectangle((0, 0), (24, 24), (19, 19))
 closed = dict.fromkeys(("left", "right", "bottom", "top"), js.neumann(0.0))

@@ -1,8 +1,8 @@
 """A catalyst pellet
 
-A gas diffuses into a porous ball and reacts. On the axis r = 0 the equation says
-by itself what holds; how much of the ball is used is 3 (m coth m - 1) / m^2 for
-Thiele's modulus m.
+A gas diffuses into a porous ball and reacts. On the axis r = 0 the equation
+says by itself what holds; how much of the ball is used is 3 (m coth m - 1) /
+m^2 for Thiele's modulus m.
 """
 
 import jax

@@ -1,7 +1,7 @@
 """Flow through a triangular duct
 
-Poiseuille's flow in an equilateral triangle is a polynomial of the third degree;
-sqrt(3) / 320 flows through a side of length 1 (Boussinesq, 1868).
+Poiseuille's flow in an equilateral triangle is a polynomial of the third
+degree; sqrt(3) / 320 flows through a side of length 1 (Boussinesq, 1868).
 """
 
 import jax

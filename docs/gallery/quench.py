@@ -1,7 +1,7 @@
 """A hot disk in cold water
 
-Time: the middle of a disk that is cooled at its rim, against Fourier's series of
-Bessel functions. The start contradicts the rim, and may.
+Time: the middle of a disk that is cooled at its rim, against Fourier's series
+of Bessel functions. The start contradicts the rim, and may.
 """
 
 import jax

@@ -1,7 +1,7 @@
 """Torsion of a square bar
 
-Prandtl's stress function: a membrane over the section. The stiffness of a square
-of side 1 is 0.140577 G (Saint-Venant), the lines are those of shear.
+Prandtl's stress function: a membrane over the section. The stiffness of a
+square of side 1 is 0.140577 G (Saint-Venant), the lines are those of shear.
 """
 
 import jax

@@ -1,7 +1,7 @@
 """A heated torus
 
-A solid, given by its signed distance. All the heat made in it leaves through its
-surface: 2 pi^2 R r^2, the volume (Pappus).
+A solid, given by its signed distance. All the heat made in it leaves through
+its surface: 2 pi^2 R r^2, the volume (Pappus).
 """
 
 import jax

@@ -1,7 +1,7 @@
 """Tuning a kernel
 
-`js.tune` finds the smoothing length and the support radius that suit a problem,
-without knowing its solution, here exp(x).
+`js.tune` finds the smoothing length and the support radius that suit a
+problem, without knowing its solution, here exp(x).
 """
 
 import jax

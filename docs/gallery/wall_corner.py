@@ -1,8 +1,8 @@
 """Heat in a wall with a corner
 
-A corner of a wall leaks more than its length says: it counts as 1 - 2 ln 2 / pi
-of a wall's thickness more. The temperature has an infinite slope at the inner
-corner; `js.adapt` finds that and makes the cloud for it.
+A corner of a wall leaks more than its length says: it counts as 1 - 2 ln 2 /
+pi of a wall's thickness more. The temperature has an infinite slope at the
+inner corner; `js.adapt` finds that and makes the cloud for it.
 """
 
 import jax
@@ -20,7 +20,7 @@ sides = {
 }
 problem = js.Problem(
     lambda u, x: js.laplacian(u)(x),
-    {"cold": js.dirichlet(0.0), "warm": js.dirichlet(1.0), "ends": js.neumann(0)},
+    {"cold": js.dirichlet(0), "warm": js.dirichlet(1), "ends": js.neumann(0)},
 )
 make = lambda spacing: js.from_polygon(corner, spacing, groups=sides)
 found = js.adapt(problem, make, tol=1e-2, start=0.25, progress=False)
