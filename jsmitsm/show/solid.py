@@ -84,6 +84,7 @@ def solid(sol: Solution, *, field: int = 0, cut: Mapping[str, float] | None = No
                 section = section if other == axis else _kept(*section, other, limit)
             corners, shades = (np.concatenate(both) for both in zip((corners, shades), section))
     faces(ax, corners, shades.mean(axis=1), label)
+    ax.view_init(40 if 2 in where else 28, {(0,): -30, (1,): 60, (0, 1): 45}.get(tuple(sorted({*where} - {2})), -60))
     drawing.dress(ax, 3)
     return ax
 

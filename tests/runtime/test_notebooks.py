@@ -18,7 +18,7 @@ def test_clouds_problems_solutions_and_evolutions():
     assert "dirichlet" in problem._repr_html_()
     sol = js.solve(problem, ROD)
     shown = sol._repr_html_()
-    assert "0 to 1" in shown and "S, 4, 4" in shown and "estimated error" not in shown and "seconds" in shown
+    assert "0 to 1" in shown and "S, 4" in shown and "estimated error" not in shown and "seconds" in shown
     sol.error_estimate()
     assert "estimated error" in sol._repr_html_()
     heat = js.Problem(lambda u, x, t: js.dt(u)(x) - js.laplacian(u)(x), ENDS)

@@ -175,7 +175,7 @@ def test_compiling_and_what_is_left_are_told(monkeypatch):
             pass
         stage.start -= 10.0
         stage.update(2)
-    assert "solve, rows, compiling (first call)" in told(seen) and "solve, rows 50%, 10 s left" in told(seen)
+    assert "solve, rows 0%, compiling (first call)" in told(seen) and "solve, rows 50%, 10 s left" in told(seen)
     with progress.bar("tune", 3) as outer, progress.bar("solve"), progress.first_call():
         outer.update(1)
     assert "tune" in told(seen)[-1] and progress.COMPILING in seen().rpartition("tune")[2]
