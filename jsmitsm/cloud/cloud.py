@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from jsmitsm.runtime import notebooks
 from jsmitsm.runtime.arrays import Array, ArrayLike
 from jsmitsm.runtime.errors import refuse_masked, some
 from jsmitsm.runtime.tracers import frozen, is_traced, owned
@@ -88,6 +89,7 @@ class Cloud:
     """
 
     cell_groups = Groups({})  # also of clouds pickled before there were any
+    _shape: Any = None  # what the particles fill, where their maker knows it: pictures end there
 
     def __init__(
         self,
@@ -109,7 +111,7 @@ class Cloud:
         object.__setattr__(self, name, value)
 
     def __getstate__(self) -> dict[str, Any]:
-        made_again = ("_inside", "_kept")  # when needed
+        made_again = ("_inside", "_kept", "_shape")  # when needed, or looked at by pictures alone
         return {name: value for name, value in self.__dict__.items() if name not in made_again}
 
     def kept(self, question: Hashable, answer: Callable[[], Any]) -> Any:
@@ -201,6 +203,17 @@ class Cloud:
     def __repr__(self) -> str:
         cells = f", cell groups {self.cell_groups!r}" if self.cell_groups else ""
         return f"Cloud({len(self)} particles in {self.dim}D, groups {self.groups!r}{cells})"
+
+    def _repr_html_(self) -> str:
+        if is_traced(self.points):
+            return repr(self)
+        points, kind = np.asarray(self.points), np.zeros(len(self))
+        for k, index in enumerate(index for name, index in self.groups.items() if name != INTERIOR):
+            kind[index] = k + 1
+        box = " x ".join(notebooks.span(axis) for axis in points.T)
+        counted = [(name, f"{len(index)} particles") for name, index in self.groups.items()]
+        title = f"{type(self).__name__}: {len(self)} particles in {self.dim}D"
+        return notebooks.shown(title, [("box", box), *counted], notebooks.dots(points, kind, len(self.groups)))
 
     def tree_flatten(self):
         return (self.points, self.normals), (self.groups, self.cell_groups)
