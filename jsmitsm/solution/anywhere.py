@@ -12,7 +12,7 @@ import numpy as np
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.cloud.quadrature import quadrature
 from jsmitsm.runtime.arrays import ArrayLike, ValueOrFunction
-from jsmitsm.runtime.tracers import frozen, is_traced, recorded
+from jsmitsm.runtime.tracers import frozen, is_traced
 from jsmitsm.solution.evaluation import checked_points, evaluated, in_domain, nearest_particles
 from jsmitsm.solution.fit import Recipe
 
