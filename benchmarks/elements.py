@@ -24,7 +24,7 @@ except ImportError:
 
 DEGREES = (3, 6)
 # The first mesh, in parts of the domain's extent, and where a run ends.
-COARSE, SECONDS = 0.25, 20.0
+COARSE, SECONDS = 0.25, 60.0
 
 
 def available() -> bool:
