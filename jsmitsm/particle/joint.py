@@ -18,7 +18,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.linalg import block_diag
 
 from jsmitsm.particle import batches, moments
 from jsmitsm.particle.elimination import Elimination, Scheme, eliminate
@@ -142,6 +141,8 @@ def _each(sides: tuple[Side, ...]) -> Any:
 
 
 def _joint(scheme: JointScheme, points: Any, sides: tuple[Side, ...], each: Any, coef: Any) -> _Joint:
+    from jax.scipy.linalg import block_diag  # takes a hundredth of a second, which only regions need
+
     near = [
         moments.support(at, ids, neighbours, None, s.decay)
         for s, at, (ids, neighbours, *_) in zip(scheme.sides, points, each)
@@ -152,7 +153,7 @@ def _joint(scheme: JointScheme, points: Any, sides: tuple[Side, ...], each: Any,
     made = [_solved(s, side, e[2], length) for s, side, e in zip(scheme.sides, sides, each)]
     rows, scale = _conditions(scheme, coef, [e[3] for e in each], length, root, made)
     basis = block_diag(*(m.basis for m in made))
-    particular = block_diag(*(r * m.particular for r, m in zip(root, made)))
+    particular = block_diag(*(r * (m.particular @ jnp.eye(len(m.lift))) for r, m in zip(root, made)))
     z, solve = null_space(rows @ basis)
     reduced = basis @ z
     values = block_diag(*(_values(s, n) for s, n in zip(scheme.sides, near)))

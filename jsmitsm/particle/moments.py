@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jsmitsm.particle.elimination import Elimination, Scheme
+from jsmitsm.particle.elimination import Deep, Elimination, Scheme, transposed
 from jsmitsm.particle.kernels import EDGE, Kernel, fitted
 from jsmitsm.particle.polynomials import FEW, Combinations, functionals, monomials
 from jsmitsm.particle.recursion import Recursion, fit_and_tail
@@ -114,7 +114,7 @@ def local_system(
     ns, fields = len(near.offset), rec.fields
     weight = near.weight.at[0].set(0.0) if skip_self else near.weight
     plain = values is None and fields == 1 and not scheme.n_data
-    if plain and rec.size <= FEW:
+    if plain and rec.size <= FEW and not isinstance(solution.particular, Deep):
         values = Combinations(near.offset, rec.reach)
     else:
         p = monomials(near.offset, rec.reach)
@@ -179,7 +179,9 @@ def functional(scheme: Scheme, near: Support, system: System, wanted: Any) -> tu
         return w, jnp.zeros((scheme.rec.n_rows, wanted.shape[0])), jnp.zeros((0, wanted.shape[0])), defect
     basis, particular = system.elimination.basis, system.elimination.particular
     v_own = system.own_solve.T @ _lacking(system, wanted, w, basis) if scheme.n_own else jnp.zeros((0, wanted.shape[0]))
-    v = _lacking(system, wanted, w, particular) - (system.own_rows @ particular).T @ v_own
+    v = _lacking(system, wanted, w, particular)
+    if scheme.n_own:
+        v = v - transposed(particular, system.own_rows.T @ v_own)
     return w, v, v_own, defect
 
 
@@ -187,7 +189,7 @@ def _lacking(system: System, wanted: Any, w: Any, matrix: Any) -> Any:
     """matrix^T (wanted^T - values^T w): what the data leave of each wanted functional of matrix's columns."""
     if isinstance(system.values, Combinations):
         return matrix.T @ wanted.T - (system.values @ matrix).T @ w
-    return matrix.T @ (wanted.T - system.values.T @ w)
+    return transposed(matrix, wanted.T - system.values.T @ w)
 
 
 def row(scheme: Scheme, near: Support, solution: Elimination, own: Any, data: Any, tests: Any) -> Row:
