@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Hashable, Iterator, Mapping
 from typing import Any
 
 import jax
@@ -16,6 +16,8 @@ from jsmitsm.runtime.tracers import frozen, is_traced, owned
 INTERIOR = "interior"
 # Coordinates beyond this, or all below its inverse, have powers that are no numbers.
 FAR = 1e100
+# What follows from the particles is kept with a cloud of up to so many, for so many different questions.
+_LARGEST_KEPT, _MOST_KEPT = 100_000, 8
 
 
 class Groups(Mapping[str, np.ndarray]):
@@ -109,8 +111,23 @@ class Cloud:
         object.__setattr__(self, name, value)
 
     def __getstate__(self) -> dict[str, Any]:
-        # What is made again when needed, and what pictures alone look at.
-        return {name: value for name, value in self.__dict__.items() if name not in ("_inside", "_shape")}
+        made_again = ("_inside", "_kept", "_shape")  # when needed, or looked at by pictures alone
+        return {name: value for name, value in self.__dict__.items() if name not in made_again}
+
+    def kept(self, question: Hashable, answer: Callable[[], Any]) -> Any:
+        """What ``answer()`` gives, or gave when it was last asked: it may rest on the question and on this cloud alone.
+
+        The next solve on a cloud finds neighbours, supports and classes as they were. It must not change what it gets.
+        """
+        if len(self) > _LARGEST_KEPT or is_traced(self.points, self.normals):
+            return answer()
+        kept = self.__dict__.setdefault("_kept", {})
+        found = kept.pop(question, None)
+        found = answer() if found is None else found
+        kept[question] = found  # the last one used stands last
+        while len(kept) > _MOST_KEPT:
+            kept.pop(next(iter(kept)), None)
+        return found
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update({name: frozen(value) for name, value in state.items()})

@@ -192,7 +192,7 @@ def edge_particles(
     at, outward = np.concatenate(points), np.concatenate(normals)
     firsts = np.cumsum([0] + [len(part) for part in points[:-1]])  # the vertices that are kept
     order = np.concatenate([firsts, np.setdiff1d(np.arange(len(at)), firsts)])
-    order = order[relaxation.uncrowded(at[order], spacing(at[order]), len(firsts))]
+    order = order[relaxation.uncrowded(at[order], outward[order], spacing(at[order]), len(firsts))]
     return levelset.Boundary(at[np.sort(order)], outward[np.sort(order)])
 
 

@@ -234,7 +234,7 @@ class Modes:
         """The largest entry (k,) of A u - lambda B mass u, relative to the sum of the sizes of its terms."""
         found = self._host("residuals")
         q = self._known("residuals")
-        a, b = (m.to_scipy()[q.pencil.free][:, q.pencil.free] for m in (q.pencil.A, q.pencil.B))
+        a, b = (m.host[q.pencil.free][:, q.pencil.free] for m in (q.pencil.A, q.pencil.B))
         weighted = np.asarray(q.weights).reshape(-1)[q.pencil.free][:, None] * found.right
         rest = np.abs(a @ found.right - (b @ weighted) * found.values).max(axis=0)
         return rest / (abs(a) @ np.abs(found.right)).max(axis=0)
@@ -312,7 +312,7 @@ class Modes:
         """The condition numbers (k,) of the values: the sizes of both vectors where their product is one."""
         found, q = self._host("flags"), self._known("flags")
         weighted = np.asarray(q.weights).reshape(-1)[q.pencil.free][:, None]
-        dual = weighted * (q.pencil.B.to_scipy()[q.pencil.free][:, q.pencil.free].T @ found.left)
+        dual = weighted * (q.pencil.B.host[q.pencil.free][:, q.pencil.free].T @ found.left)
         return np.linalg.norm(found.right, axis=0) * np.linalg.norm(dual, axis=0)
 
     def _part(self) -> np.ndarray:

@@ -160,3 +160,14 @@ def refuse_masked(value: Any, name: str) -> None:
             f"{name}: {hidden.sum()} of its {hidden.size} entries are masked, as {first}; fill them (np.ma.filled) or "
             "drop them"
         )
+
+
+def is_whole(value: Any, least: float = -np.inf, most: float = np.inf) -> bool:
+    """Whether a value is a whole number of this range; True and False are none."""
+    return isinstance(value, (int, np.integer)) and not isinstance(value, bool) and bool(least <= value <= most)
+
+
+def is_number(value: Any) -> bool:
+    """Whether a value is a finite real number; True and False are none."""
+    real = isinstance(value, (int, float, np.number)) and not isinstance(value, (bool, np.complexfloating))
+    return real and bool(np.isfinite(value))

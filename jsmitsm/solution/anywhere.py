@@ -12,8 +12,8 @@ import numpy as np
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.cloud.quadrature import quadrature
 from jsmitsm.runtime.arrays import ArrayLike, ValueOrFunction
-from jsmitsm.runtime.tracers import frozen, is_traced, recorded
-from jsmitsm.solution.evaluation import checked_points, evaluated, evaluated_padded, in_domain, nearest_particles
+from jsmitsm.runtime.tracers import frozen, is_traced
+from jsmitsm.solution.evaluation import checked_points, evaluated, in_domain, nearest_particles
 from jsmitsm.solution.fit import Recipe
 
 
@@ -173,15 +173,13 @@ class Anywhere:
                 f"multi_index: expected {self.cloud.dim} non-negative orders with a sum of at most {self.order}, "
                 f"got {multi_index!r}"
             )
-        near, weight = nearest_particles(self.cloud, points, self.cloud.dim + 2 if blend else 1)
-        inside = in_domain(self.cloud, points, outside)
-        known = not recorded() and not is_traced(self.cloud.points, self._taylor, points, near, weight, inside)
-        values = (evaluated_padded if known else evaluated)(
-            b, self._recipe.reach, self.cloud.points, self._taylor, points, near, weight
-        )
-        xp: Any = np if known else jnp
-        values = values if inside is None else xp.where(inside[:, None], values, np.nan)
-        return jnp.asarray(values[:, 0] if self._recipe.fields == 1 else values)
+        near, weight, first = nearest_particles(self.cloud, points, self.cloud.dim + 2 if blend else 1)
+        inside = in_domain(self.cloud, points, outside, first)
+        values = evaluated(b, self._recipe.reach, self.cloud.points, self._taylor, points, near, weight)
+        xp = jnp if is_traced(values, inside) else np
+        values = values if inside is None else xp.where(inside[:, None], values, xp.nan)
+        values = values[:, 0] if self._recipe.fields == 1 else values
+        return jax.device_put(values) if xp is np else values
 
     def integral(self, group: str | None = None) -> jax.Array:
         """The integral of u over a boundary group, or without a name over the domain.

@@ -159,6 +159,11 @@ class Solution(Anywhere):
         return error
 
     @property
+    def neighbours(self) -> np.ndarray:
+        """Every particle's stencil (N, w): itself and those that it sees, padded with -1; images count from N."""
+        return np.asarray(self._fit.neighbours)
+
+    @property
     def defects(self) -> bool:
         """Whether the estimate knows defects, and ``correction`` more than the size of the error."""
         return not hasattr(self._fit, "error_estimate")
