@@ -77,6 +77,7 @@ class Elimination(NamedTuple):
     particular: Any  # (F K, rows), or Deep
     lift: Any  # (rows,)
     rows: Any  # (F, F K): the equations themselves, needed by collocation
+    units: Any  # (F,): of the fields, beside powers of the length
 
 
 @lru_cache(maxsize=64)
@@ -103,11 +104,11 @@ def eliminate(scheme: Scheme, jac: Any, length: Any) -> Elimination:
     jac (E, S, T). Method S and SSPH use polynomials that are orthonormal over the support.
     """
     rec = scheme.rec
-    matrix, lift = constraints(rec, jac, length)
+    matrix, lift, units = constraints(rec, jac, length)
     rows = matrix[np.array(rec.equation_rows)]
     white = jnp.asarray(_whitening(rec))
     if scheme.method == "SSPH":
-        return Elimination(white, jnp.zeros((white.shape[0], matrix.shape[0])), lift, rows)
+        return Elimination(white, jnp.zeros((white.shape[0], matrix.shape[0])), lift, rows, units)
     low, _, first, _ = fit_and_tail(rec)
     fitted = matrix if not rec.depth else matrix[first][:, low]
     if scheme.method == "S":
@@ -122,7 +123,7 @@ def eliminate(scheme: Scheme, jac: Any, length: Any) -> Elimination:
         z = z[:, : len(scheme.free)]
     if rec.depth:
         z, q = _deepened(scheme, matrix, z, q)
-    return Elimination(z, q, lift, rows)
+    return Elimination(z, q, lift, rows, units)
 
 
 @dataclass(frozen=True)
@@ -230,7 +231,8 @@ def unconstrained(scheme: Scheme) -> tuple[Scheme, Elimination]:
     """The scheme of a plain polynomial fit of the same order, and what stands for the recursion that it has not."""
     rec = replace(scheme.rec, degrees=(-1,) * len(scheme.rec.degrees), depth=0)
     white = _whitening(rec)
-    made = Elimination(white, np.zeros((len(white), 0)), np.zeros(0), np.zeros((rec.fields, len(white))))
+    nothing = np.zeros((len(white), 0)), np.zeros(0), np.zeros((rec.fields, len(white)))
+    made = Elimination(white, *nothing, np.ones(rec.fields))
     return replace(scheme, rec=rec, sourced=False, flat=False, lost=0), made
 
 
@@ -252,11 +254,11 @@ def _eliminated_once(
 
 def _eliminated(scheme: Scheme, jac: np.ndarray, length: float) -> Elimination:
     rec = scheme.rec
-    matrix, lift = constraints(rec, jac, length, np)
+    matrix, lift, units = constraints(rec, jac, length, np)
     rows = matrix[np.array(rec.equation_rows)]
     white = _whitening(rec)
     if scheme.method == "SSPH":
-        return Elimination(white, np.zeros((white.shape[0], len(matrix))), lift, rows)
+        return Elimination(white, np.zeros((white.shape[0], len(matrix))), lift, rows, units)
     low, _, first, _ = fit_and_tail(rec)
     fitted = matrix[np.ix_(first, low)] if rec.depth else matrix
     if scheme.method == "S":
@@ -269,7 +271,7 @@ def _eliminated(scheme: Scheme, jac: np.ndarray, length: float) -> Elimination:
         basis[dependent] = -particular[dependent] @ fitted[:, free]
     if rec.depth:
         basis, particular = _deepened_on_host(scheme, matrix, basis, particular)
-    return Elimination(basis, particular, lift, rows)
+    return Elimination(basis, particular, lift, rows, units)
 
 
 def _deepened_on_host(

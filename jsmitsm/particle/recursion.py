@@ -234,19 +234,41 @@ def row_lifts(rec: Recursion, length: Any, xp: Any = jnp) -> Any:
     return xp.stack([length ** int(k) for k in levels])[place]
 
 
-def constraints(rec: Recursion, jac: Any, length: Any, xp: Any = jnp) -> tuple[Any, Any]:
-    """The constraint matrix of one particle and the factors of its right-hand side.
+def constraints(rec: Recursion, jac: Any, length: Any, xp: Any = jnp) -> tuple[Any, Any, Any]:
+    """The constraint matrix of one particle, the factors of its right-hand side and the units of its fields.
 
     jac (E, S, T): Taylor coefficients of the operator's coefficients (T = 1 if constant);
-    length: scalar scale. Returns C (rows, F K) with rows of unit length, and the factors (rows,)
-    that turn the Taylor coefficients of the source into the right-hand side.
+    length: scalar scale. Returns C (rows, F K) with rows of unit length, the factors (rows,)
+    that turn the Taylor coefficients of the source into the right-hand side, and ``field_units`` (F,).
     """
     powers = _powers(rec, jac.shape[-1])
     scaled = jac * (length ** xp.arange(int(powers.max()) + 1))[powers]
     matrix = _scattered(rec, scaled, np) if xp is np else _gathered(rec, scaled)
+    units = field_units(rec, matrix, xp)
+    if any(rec.weights):
+        matrix = matrix * xp.repeat(units, rec.size)
     square = xp.sum(matrix**2, axis=1)
     norm = xp.sqrt(xp.where(square > 0, square, 1.0))  # an empty row has a derivative too
-    return matrix / norm[:, None], row_lifts(rec, length, xp) / norm
+    return matrix / norm[:, None], row_lifts(rec, length, xp) / norm, units
+
+
+def field_units(rec: Recursion, matrix: Any, xp: Any = jnp) -> Any:
+    """The units (F,) in which fields that count fewer derivatives weigh as much as the others in the equations.
+
+    A pressure is in units of viscosity over length, or of momentum where that is more: a power of length alone
+    leaves it so much too light, or too heavy, as the viscosity differs from one, and its modes between the particles
+    are held by nothing. Fields of weight zero keep their units.
+    """
+    if not any(rec.weights):
+        return xp.ones(rec.fields)
+    equations = np.array(rec.equation_rows)
+    squares = xp.sum(matrix[equations].reshape(len(equations), rec.fields, rec.size) ** 2, axis=2)  # (E, F)
+    heavy = np.array(rec.weights) == 0
+    others = xp.sum(xp.where(heavy, squares, 0.0), axis=1)
+    shared = (squares > 0) & (others > 0)[:, None]
+    own, rest = xp.sum(xp.where(shared, squares, 0.0), axis=0), xp.sum(xp.where(shared, others[:, None], 0.0), axis=0)
+    known = (own > 0) & ~heavy
+    return xp.where(known, xp.sqrt(xp.where(known, rest, 1.0) / xp.where(known, own, 1.0)), 1.0)
 
 
 def source_rows(rec: Recursion, residual: Any) -> Any:
