@@ -88,8 +88,8 @@ def modes(plt):
 
 def time(plt):
     """Gray and Scott's equations on a periodic square: a spot that divides."""
-    cloud = js.rectangle((0, 0), (1, 1), (49, 49), jitter=0.2)
-    run = js.evolve(gray_scott(), cloud, spot, t=(0.0, 600.0), steps=600, order=4, save=[150.0, 350.0])
+    cloud = js.rectangle((0, 0), (1, 1), (33, 33), jitter=0.2)
+    run = js.evolve(gray_scott(), cloud, spot, t=(0.0, 400.0), steps=240, order=4, save=[80.0, 200.0])
     fig, axes = plt.subplots(1, 4, figsize=(11, 2.9), layout="constrained")
     for ax, t, u in zip(axes, run.t, run.u):
         js.plot.values(cloud, u[:, 1], colorbar=False, ax=ax)
