@@ -328,8 +328,8 @@ def table(data: dict[str, Any]) -> dict[str, Any]:
     lines = [out | {"timed": case in TIMED} for case in CASES for out in data.get(case, [])]
     rows = [
         [out["case"], out["order"], f"{out['unknowns']:,}", f"{out['steps']:,}", f"{out['error']:.1e}",
-         f"{out['wanted']:.1e}" if out["wanted"] else "", f"{out['seconds']:.2f}" if out["timed"] else "", remark(out)]
-        for out in lines
+         f"{out['wanted']:.1e}" if out["wanted"] else "", f"{out['seconds']:.2f}" if out["timed"] else "",
+         remark(out)] for out in lines
     ]  # fmt: skip
     note = (
         "Largest errors at the end (`python -m benchmarks.evolution`), seconds of a call on two cores where they were "
