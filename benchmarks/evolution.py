@@ -333,8 +333,9 @@ def table(data: dict[str, Any]) -> dict[str, Any]:
     ]  # fmt: skip
     note = (
         "Largest errors at the end (`python -m benchmarks.evolution`), seconds of a call on two cores where they were "
-        "measured on a quiet machine. On random particles the error must not grow with the number of steps. scikit-fem's P2 elements have curved sides and are stepped by this "
-        "package's KenCarp4 and factors; the error of a gradient is relative to differences of fourth order."
+        "measured on a quiet machine. On random particles the error must not grow with the number of steps. "
+        "scikit-fem's P2 elements have curved sides and are stepped by this package's KenCarp4 and factors; the error "
+        "of a gradient is relative to differences of fourth order."
     )
     return {"columns": ["problem", "order", "unknowns", "steps", "error", "wanted", "seconds", ""], "rows": rows,
             "note": note}  # fmt: skip
