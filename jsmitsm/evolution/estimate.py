@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from jsmitsm.discretization.pencil.assemble import assemble_pencil
 from jsmitsm.evolution.run import Run
 from jsmitsm.evolution.space.semidiscrete import Semidiscrete
 from jsmitsm.evolution.steps import dense_output
@@ -24,7 +23,7 @@ def estimated(run: Run, times: np.ndarray, history: tuple[np.ndarray, np.ndarray
     semi, (steps, values) = run.semi, history
     out = np.zeros((len(times), semi.n, semi.fields))
     if len(steps) > 1 and not run.timed.quasilinear and run.order + 2 <= HIGHEST:
-        high = _higher(run)
+        high = run.finer()
         span = float(steps[-1] - steps[0])
         for k, t in enumerate(times):
             out[k] = _one(semi, high, steps, values, float(t), span)
@@ -32,12 +31,6 @@ def estimated(run: Run, times: np.ndarray, history: tuple[np.ndarray, np.ndarray
         out += in_time * np.abs(values).max()
     out.reshape(len(times), -1)[1:, semi.held] = 0.0
     return out
-
-
-def _higher(run: Run) -> Semidiscrete:
-    problem = run.timed.at(np.asarray(float(run.t[0])), run.params)
-    pencil = assemble_pencil(problem, run.cloud, order=run.order + 2, depth=run.depth)
-    return Semidiscrete(run.timed, pencil, run.params, 0.0)
 
 
 def _one(semi: Semidiscrete, high: Semidiscrete, steps: Any, values: Any, t: float, span: float) -> np.ndarray:

@@ -10,8 +10,6 @@ import numpy as np
 from jsmitsm.evolution.estimate import estimated
 from jsmitsm.evolution.evolution import Evolution, Report
 from jsmitsm.evolution.run import Run
-from jsmitsm.evolution.space.local_fits import StateFit
-from jsmitsm.evolution.space.semidiscrete import local_fits
 from jsmitsm.evolution.steps import dense_output
 from jsmitsm.evolution.steps.control import controlled
 from jsmitsm.evolution.steps.stepping import Step, Stopped
@@ -221,10 +219,9 @@ def _finished(
     if in_time is not None and in_time > LARGE:
         flags.append(f"The estimated error in time is {in_time:.0%} of the solution: take more steps, or a tol.")
     stats = _statistics(run, began, in_time)
-    disc = run.semi.disc
     degree = min(run.order + 2, HIGHEST)
     recipe = Recipe("S", run.order, None, "loo", run.fields, degree - run.order)
-    fit = StateFit(run.cloud, degree, lambda: local_fits(disc, degree))
+    fit = run.semi.state_fit(degree)
     kept = np.array(history.times), np.stack(history.states)
     report = Report(flags, told, lambda: estimated(run, np.asarray(times), kept, in_time))
     return Evolution(times, states, rates, run.cloud, recipe, not fault, stats, kept, report, fit)
