@@ -54,7 +54,8 @@ def evolve(
         The particles it is solved on.
     u0 : function, array_like or pair of them
         The start, a function of x, a number or an array (N,) or (N, F), with several regions also a dict of functions
-        or numbers by region; for second order in time a pair of them, u and its rate. Where it differs from the conditions the run begins with the impulse that this is.
+        or numbers by region; for second order in time a pair of them, u and its rate. Where it differs from the
+        conditions the run begins with the impulse that this is.
     t : pair of float
         (t0, t1), the start and the end.
     steps : int, optional

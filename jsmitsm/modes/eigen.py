@@ -62,8 +62,8 @@ def eigen(
         A real number; the values nearest to it are found.
     mass : float, array or function, optional
         A number, an array (F,), or a function of x (and of the problem's params, where it takes two arguments),
-        scalar or (F,), with several regions also a dict of these by region; 1 if not given. Equation k has the mass times field k on its right-hand side; zero for an
-        equation without it.
+        scalar or (F,), with several regions also a dict of these by region; 1 if not given. Equation k has the mass
+        times field k on its right-hand side; zero for an equation without it.
     method : {"S"}
         "S", the only one whose rows know their source.
     order : int

@@ -53,7 +53,8 @@ class RegionsRun(Run):
 
     def _refuse_convection(self) -> None:
         for name, part in self.timed.parts.items():
-            region, told = self.cloud.region(name), []
+            region = self.cloud.region(name)
+            told: list[str] = []
             view: Any = SimpleNamespace(timed=part, second=False, points=region.points, fields=self.fields)
             try:
                 refuse_convection(view, told)

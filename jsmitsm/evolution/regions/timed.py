@@ -1,4 +1,4 @@
-"""A problem with several regions in time: the parts of each region's, and conditions between them that know the time."""
+"""A problem with several regions in time: the parts of each, and conditions between them that know the time."""
 
 from __future__ import annotations
 
@@ -93,8 +93,8 @@ def _check_part(name: str, part: Timed) -> None:
         )
     if not part.linear:
         raise ValueError(
-            f"pde[{name!r}]: nonlinear in u, or with coefficients that depend on t, which js.evolve does for one region "
-            "alone; linearise it, or step in time with js.solve: backward Euler, (u - old) / dt in place of js.dt(u)"
+            f"pde[{name!r}]: nonlinear in u, or with coefficients that depend on t, which js.evolve does for one "
+            "region alone; linearise it, or take the steps of backward Euler by js.solve, with (u - old) / dt for the rate"
         )
 
 
