@@ -22,7 +22,6 @@ from jsmitsm.discretization.local_data import around, right_sides
 from jsmitsm.discretization.pencil.assemble import (
     Layout,
     Pencil,
-    Sparse,
     condition_values,
     default_depth,
     laid_out,
@@ -30,6 +29,7 @@ from jsmitsm.discretization.pencil.assemble import (
 )
 from jsmitsm.discretization.pencil.grades import Fitness
 from jsmitsm.discretization.pencil.local import source_stencil_size, source_stencils
+from jsmitsm.discretization.pencil.sparse import Sparse
 from jsmitsm.discretization.regions.layout import Regions, discretize_regions
 from jsmitsm.discretization.regions.rows import Joints, RegionNumbers, joint_rows, joints, region_numbers, spread
 from jsmitsm.equation.problem import Problem

@@ -115,7 +115,7 @@ def _between(c: Condition, fields: int, split: Any, where: str) -> Condition:
         return lambda u, x, n, *more: split(lambda x, n, *p: given(_complex(u), x, n, *p))(x, n, *more)
 
     if jnp.iscomplexobj(parts.get("resistance")):
-        raise ValueError(f"{where}.resistance: complex, which couples the two parts; write it as a residual(a, b, x, n)")
+        raise ValueError(f"{where}.resistance: complex, which couples the parts; write it as a residual(a, b, x, n)")
     for name in ("one", "two"):
         parts[name] = flux(parts[name])
     for name in ("jump", "source"):

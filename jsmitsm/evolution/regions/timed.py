@@ -94,7 +94,7 @@ def _check_part(name: str, part: Timed) -> None:
     if not part.linear:
         raise ValueError(
             f"pde[{name!r}]: nonlinear in u, or with coefficients that depend on t, which js.evolve does for one "
-            "region alone; linearise it, or take the steps of backward Euler by js.solve, with (u - old) / dt for the rate"
+            "region alone; linearise it, or step by backward Euler and js.solve, with (u - old) / dt for the rate"
         )
 
 
