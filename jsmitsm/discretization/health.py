@@ -79,11 +79,15 @@ def repaired(
         elif not weak.all():
             new_classes.append(_some(cls, ~weak))
             new_rows.append(_take(row, ~weak))
-    for found in pieces.values():
+    sizes = {key: max(int((cls.neighbours >= 0).sum(axis=1).max()) for cls, *_ in some) for key, some in pieces.items()}
+    if disc.part is not None:
+        names = {key: (key[0].n_own, key[0].lost, key[1]) for key in pieces}
+        largest = disc.part.largest({names[key]: size for key, size in sizes.items()})
+        sizes = {key: largest[name] for key, name in names.items()}
+    for key, found in pieces.items():
         poor = [(_some(cls, at), _take(row, at)) for cls, row, at in found if len(at)]
         if poor:
-            size = max(int((cls.neighbours >= 0).sum(axis=1).max()) for cls, *_ in found)
-            cls, row, changed = _repaired(disc, nums, poor, size)
+            cls, row, changed = _repaired(disc, nums, poor, sizes[key])
             new_classes.append(cls)
             new_rows.append(row)
             touched.append(changed)

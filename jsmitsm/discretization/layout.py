@@ -14,7 +14,7 @@ from jsmitsm.cloud.neighbours import Stencils
 from jsmitsm.cloud.regions.region_cloud import RegionCloud
 from jsmitsm.cloud.walls import Walls, seen
 from jsmitsm.discretization.periodic import Images, periodic_images, with_corners
-from jsmitsm.discretization.supports import check_supports, cut_off, default_kernel, find_stencils, walls_of
+from jsmitsm.discretization.supports import Part, check_supports, cut_off, default_kernel, find_stencils, walls_of
 from jsmitsm.equation.branches import FIELD
 from jsmitsm.equation.closing import closed
 from jsmitsm.equation.conditions import Group, group_conditions
@@ -72,6 +72,7 @@ class Discretization:
     # Where the equation degenerates, (N,): rows of the recursion that add nothing, conditions that it implies.
     lost: np.ndarray | None = None
     dropped: np.ndarray | None = None
+    part: Part | None = None  # of a cloud that several processes share
 
     @property
     def points(self) -> Any:
@@ -92,7 +93,8 @@ class Discretization:
     @property
     def active(self) -> np.ndarray:
         """The particles that carry equations, ascending."""
-        return np.flatnonzero(~self.held.all(axis=1))
+        free = ~self.held.all(axis=1)
+        return np.flatnonzero(free if self.part is None else free & self.part.own)
 
     @property
     def unknowns(self) -> np.ndarray:
@@ -106,6 +108,7 @@ class Discretization:
 def discretize(
     problem: Problem, cloud: Cloud, method: str, order: int, kernel: Kernel | None,
     stencils: Stencils | None, basis_terms: int | None, sources: bool = True, depth: int | str = "auto",
+    part: Part | None = None,
 ) -> Discretization:  # fmt: skip
     """Trace the problem, lay out its recursion and conditions, and find neighbours.
 
@@ -125,7 +128,7 @@ def discretize(
     if depth == "auto":
         depth = suited_depth(method, rec, flat, sourced)
     rec = recursion(cloud.dim, order, problem.fields, traced.slots, traced.pattern, traced.order, int(depth))
-    groups = group_conditions(problem, with_corners(problem, cloud), order, traced.order)
+    groups = group_conditions(problem, with_corners(problem, cloud), order, traced.order, part is None)
     held = np.zeros((len(cloud), problem.fields), bool)
     for group in groups:
         for k in group.held:
@@ -154,10 +157,10 @@ def discretize(
         raise ValueError(
             f"kernel: the derivatives of js.Constant vanish, and method {method} tests with them; use another kernel"
         )
-    given_stencils, walls = stencils is not None, walls_of(problem, cloud, images)
+    given_stencils, walls = stencils is not None, walls_of(problem, cloud, images, part)
     if stencils is None:
         conditioned = np.flatnonzero((n_own > 0) & ~held.all(axis=1))
-        stencils = find_stencils(cloud, kernel, scheme, images, conditioned, walls)
+        stencils = find_stencils(cloud, kernel, scheme, images, conditioned, walls, part)
     elif len(stencils) != len(cloud):
         raise ValueError(f"stencils: built for {len(stencils)} particles, the cloud has {len(cloud)}; build them again")
     elif stencils.radius is not None and not is_traced(stencils):  # those of a former solve were looked at then
@@ -166,7 +169,7 @@ def discretize(
         kernel = default_kernel(cloud.points, np.arange(len(cloud)), stencils.indices)
     disc = Discretization(
         problem, cloud, kernel, stencils, traced, rec, groups, scheme, [], held, partner, images, n_own, walls,
-        given_stencils,        basis_terms,
+        given_stencils, basis_terms, part=part,
     )  # fmt: skip
     if given_stencils or kernel is not None:
         check_supports(scheme, stencils, kernel, disc.points, n_own, disc.active)
@@ -193,6 +196,8 @@ def suited_depth(method: str, rec: Recursion, flat: bool, sourced: bool) -> int:
 
 def mean_spacing(disc: Discretization) -> float:
     """The edge of the cube that each particle has for itself."""
+    if disc.part is not None:
+        return disc.part.spacing
     points = np.asarray(concrete(disc.cloud.points))
     return float((np.prod(np.ptp(points, axis=0)) / len(points)) ** (1.0 / disc.rec.dim))
 
@@ -230,7 +235,7 @@ def sorted_classes(disc: Discretization, ids: np.ndarray, stencils: Stencils) ->
         used = [near.shape[1]] * 2
     else:
         counts = np.max(np.where(near[ids] >= 0, np.arange(near.shape[1]), 0), axis=1, initial=0) + 1
-        narrow = int(np.sort(counts)[4 * (len(ids) - 1) // 5]) if len(ids) else 1
+        narrow = _most_need(counts, disc.part)
         wide = counts > 1.25 * narrow
         widest = int(counts[~wide].max(initial=1)), near.shape[1]
         used = [_width_at_hand(disc.scheme, rounded_width(width)) for width in widest]
@@ -241,6 +246,15 @@ def sorted_classes(disc: Discretization, ids: np.ndarray, stencils: Stencils) ->
         if len(some):
             classes += split(disc, Class(some, near[some][:, :width], disc.scheme, bool(k)))
     return classes
+
+
+def _most_need(counts: np.ndarray, part: Part | None) -> int:
+    """How many neighbours four fifths of all particles have at the most."""
+    if part is None:
+        return int(np.sort(counts)[4 * (len(counts) - 1) // 5]) if len(counts) else 1
+    widest = part.largest({"": int(counts.max(initial=1))})[""]
+    upto = np.cumsum(part.total(np.bincount(counts, minlength=widest + 1)))
+    return int(np.searchsorted(upto, 4 * (upto[-1] - 1) // 5, side="right"))
 
 
 def split(disc: Discretization, cls: Class) -> list[Class]:

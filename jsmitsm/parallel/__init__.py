@@ -1,0 +1,10 @@
+"""Several processes, one problem: particles shared by bisection, rows as on one, solved under PETSc.
+
+Imports show and what stands before it. ``import jsmitsm.parallel as jp``; run as ``mpiexec -n 4 python script.py``.
+"""
+
+from jsmitsm.parallel.distributed import ParallelCloud, read
+from jsmitsm.parallel.solution import ParallelSolution, evaluate, norm
+from jsmitsm.parallel.solve import solve
+
+__all__ = ["ParallelCloud", "ParallelSolution", "evaluate", "norm", "read", "solve"]
