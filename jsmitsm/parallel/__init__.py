@@ -4,7 +4,13 @@ Imports show and what stands before it. ``import jsmitsm.parallel as jp``; run a
 """
 
 from jsmitsm.parallel.distributed import ParallelCloud, read
+from jsmitsm.parallel.estimate import error_estimate
+from jsmitsm.parallel.files import save
+from jsmitsm.parallel.gradient import value_and_grad
 from jsmitsm.parallel.solution import ParallelSolution, evaluate, norm
 from jsmitsm.parallel.solve import solve
 
-__all__ = ["ParallelCloud", "ParallelSolution", "evaluate", "norm", "read", "solve"]
+__all__ = [
+    "ParallelCloud", "ParallelSolution", "error_estimate", "evaluate", "norm", "read", "save", "solve",
+    "value_and_grad",
+]  # fmt: skip
