@@ -85,12 +85,14 @@ def _defects(local: Local, nums: Any, classes: Any, rows: Any, values: np.ndarra
 def _median(us: Team, values: np.ndarray) -> float:
     """The median of what all processes have, to rounding."""
     ends = us.gather((float(values.min(initial=np.inf)), float(values.max(initial=-np.inf)), len(values)))
-    low, high = min(a for a, _, _ in ends), max(b for _, b, _ in ends)
-    half = sum(n for *_, n in ends) / 2.0
-    if not half:
+    count = sum(n for *_, n in ends)
+    if not count:
         return 1.0
+    # The two in the middle, which are one where the count is odd.
+    wanted = np.array([(count - 1) // 2 + 1, count // 2 + 1])
+    low, high = (np.full(2, end) for end in (min(a for a, *_ in ends), max(b for _, b, _ in ends)))
     for _ in range(_HALVINGS):
         middle = (low + high) / 2.0
-        below = us.total(int((values <= middle).sum())) >= half
-        low, high = (low, middle) if below else (middle, high)
-    return high
+        below = us.total((values[:, None] <= middle).sum(axis=0)) >= wanted
+        low, high = np.where(below, low, middle), np.where(below, middle, high)
+    return float(high.mean())
