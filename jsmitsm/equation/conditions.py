@@ -64,7 +64,9 @@ def group_conditions(
 ) -> list[Group]:
     """Check the conditions against the cloud and lay them out, one entry per boundary group.
 
-    orders: those of the operator's equations; whole: not a part of a cloud, which may lack sides. Raises ValueError for missing, unknown or impossible conditions.
+    orders: those of the operator's equations; whole: not a part of a cloud, which may lack sides.
+
+    Raises ValueError for missing, unknown or impossible conditions.
     """
     highest = max(orders)
     names = [name for name in cloud.groups if name != INTERIOR]

@@ -196,8 +196,9 @@ def slab_of(us: Team, cloud: Any) -> Slab:
         group[ids], place[ids] = k, np.arange(len(ids))
     points = np.asarray(cloud.points, float)
     normals = np.full(points.shape, np.nan) if cloud.normals is None else np.asarray(cloud.normals, float)
-    return Slab(tuple(cloud.groups), len(cloud), np.arange(some.start, some.stop), points[some], normals[some],
-                group[some], place[some], cloud.normals is not None, tuple(map(len, cloud.groups.values())))  # fmt: skip
+    number, sizes = np.arange(some.start, some.stop), tuple(map(len, cloud.groups.values()))
+    return Slab(tuple(cloud.groups), len(cloud), number, points[some], normals[some], group[some], place[some],
+                cloud.normals is not None, sizes)  # fmt: skip
 
 
 def bisected(us: Team, slab: Slab) -> Slab:

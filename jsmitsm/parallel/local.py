@@ -1,4 +1,4 @@
-"""The part of a problem that one process discretises: its own particles in their halo, which is widened until it serves.
+"""The part of a problem that one process discretises: its own particles in their halo, which is widened as needed.
 
 The rows are those that one process alone would make. What they need of the whole cloud (is it even, how many
 neighbours have most, how large are stencils that a repair widens) the processes decide together.
@@ -14,7 +14,7 @@ import numpy as np
 
 from jsmitsm.cloud.neighbours import EVEN_SAMPLE, Stencils, is_even, kept_distances, nearest
 from jsmitsm.discretization.coefficients import Numbers, numbers
-from jsmitsm.discretization.layout import Class, Discretization, discretize, sorted_classes, table
+from jsmitsm.discretization.layout import Class, discretize, sorted_classes, table
 from jsmitsm.discretization.operator_kind import prefers_least_squares
 from jsmitsm.discretization.rows import all_coefficients
 from jsmitsm.discretization.supports import Part

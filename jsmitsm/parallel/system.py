@@ -67,8 +67,8 @@ class System:
             if error <= BACKWARD_ERROR:
                 return x
         raise SolveError(
-            f"{' and '.join(self.ways)} left a backward error of {error:.1e} of the global system, which is singular or "
-            "beyond this solver; is a condition missing, or the operator at a resonance? Try solver=\"mumps\""
+            f"{' and '.join(self.ways)} left a backward error of {error:.1e} of the global system, which is singular "
+            "or beyond this solver; is a condition missing, or the operator at a resonance? Try solver=\"mumps\""
         )
 
     def _refined(self, way: str, matrix: Any, b: np.ndarray, transpose: bool) -> tuple[np.ndarray, float, int]:
@@ -81,7 +81,7 @@ class System:
         best, kept, steps = np.inf, np.zeros(self.n), 0
         try:
             solver = self._solver(way, matrix, transpose)
-            for k in range(CORRECTIONS):
+            for _ in range(CORRECTIONS):
                 solver.solve(residual, step)
                 steps = steps or solver.getIterationNumber()
                 x.axpy(1.0, step)

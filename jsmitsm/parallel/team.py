@@ -75,7 +75,7 @@ class Team:
 class Phase:
     """Local work in which any process may fail: all leave it with the error of the first that did.
 
-    Inside, processes meet in ``Team.gather`` alone; one that failed comes to the next meeting of the others and says so.
+    Inside, processes meet in ``Team.gather`` alone; one that failed comes to the others' next meeting and says so.
     """
 
     def __init__(self, team: Team, names: Any):

@@ -87,7 +87,8 @@ def correction(fit: Fit, values: Any) -> Correction:
 def one_scale(mine: Any, theirs: Any, disc: Discretization, own: Any = True, median: Any = None) -> Any:
     """The ratios (N, F) of the weights that the source has in the rows of both orders, without outliers.
 
-    own (N,): the particles that have rows, and median: of the whole cloud's, where this is a part of one. A row with a condition of its own hardly hangs on the source, whose weights may vanish there in one of the two.
+    own (N,): the particles that have rows, and median: of the whole cloud's, where this is a part of one.
+    A row with a condition of its own hardly hangs on the source, whose weights may vanish there in one of the two.
     """
     xp = jnp if is_traced(mine, theirs) else np
     known = (mine != 0) & (theirs != 0)

@@ -1,4 +1,4 @@
-"""What several processes find, against one: run under mpiexec by test_parallel, which reads the numbers printed last."""
+"""What several processes find, against one: run under mpiexec by test_parallel, which reads what is printed last."""
 
 import json
 import sys
