@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from jsmitsm.runtime.errors import SolveError
+from jsmitsm.runtime.errors import SolveError, some
 
 # Seconds that the others leave the first process for the message.
 PATIENCE = 5.0
@@ -88,11 +88,12 @@ class Phase:
         if error is None:
             self.team.gather(None)
         elif isinstance(error, Exception) and not getattr(error, "told", False):
-            particles = getattr(error, "particles", ())
-            if self.names is not None and len(particles):
-                particles = tuple(np.asarray(self.names)[list(particles)].tolist())
+            if isinstance(error, SolveError) and self.names is not None and len(error.particles):
+                error.particles = tuple(np.asarray(self.names)[list(error.particles)].tolist())
+                error.args = (f"{error.args[0]}; its numbers are those of the part of process {self.team.rank}, in the "
+                              f"whole cloud they are {some(error.particles)}",)  # fmt: skip
             what = "SolveError" if isinstance(error, SolveError) else type(error).__name__
-            self.team.comm.allgather(((what, str(error), particles), None))
+            self.team.comm.allgather(((what, str(error), getattr(error, "particles", ())), None))
             error.told = True  # type: ignore[attr-defined]
 
 
