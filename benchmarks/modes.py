@@ -186,7 +186,7 @@ def spectra(quick: bool) -> Iterator[dict[str, Any]]:
 def spectrum(kind: str, name: str, cloud: js.Cloud, bcs: Any, order: int, depth: int) -> dict[str, Any]:
     """The eigenvalues of B^-1 A; particles that follow their neighbours are eliminated."""
     pencil = assemble_pencil(js.Problem(lambda u, x: js.laplacian(u)(x), bcs), cloud, order=order, depth=depth)
-    a, b = (m.to_scipy().toarray()[np.ix_(pencil.free, pencil.free)] for m in (pencil.A, pencil.B))
+    a, b = (m.host.toarray()[np.ix_(pencil.free, pencil.free)] for m in (pencil.A, pencil.B))
     slaved = np.isin(pencil.free, pencil.slaved)
     own = ~slaved
     extended = np.zeros((len(own), own.sum()))

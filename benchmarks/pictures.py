@@ -9,6 +9,7 @@ import numpy as np
 import jsmitsm as js
 from benchmarks.adaptation import true_error
 from benchmarks.commandline import arguments
+from benchmarks.evolution import gray_scott, spot
 from benchmarks.nist import CASES as NIST
 from benchmarks.problems import CASES
 
@@ -85,6 +86,18 @@ def modes(plt):
     return fig
 
 
+def time(plt):
+    """Gray and Scott's equations on a periodic square: a spot that divides."""
+    cloud = js.rectangle((0, 0), (1, 1), (49, 49), jitter=0.2)
+    run = js.evolve(gray_scott(), cloud, spot, t=(0.0, 600.0), steps=600, order=4, save=[150.0, 350.0])
+    fig, axes = plt.subplots(1, 4, figsize=(11, 2.9), layout="constrained")
+    for ax, t, u in zip(axes, run.t, run.u):
+        js.plot.values(cloud, u[:, 1], colorbar=False, ax=ax)
+        ax.set_title(f"t = {t:.0f}", fontsize="medium")
+        ax.set_axis_off()
+    return fig
+
+
 def adaptation(plt):
     """A corner singularity to 1e-6, its place unknown."""
     case = NIST["corner-270"]()
@@ -109,7 +122,7 @@ def regions(plt):
     return fig
 
 
-PICTURES = ("first", "slices", "errors", "regions", "modes", "adaptation")
+PICTURES = ("first", "slices", "errors", "regions", "modes", "time", "adaptation")
 
 
 def main(names=PICTURES):

@@ -17,7 +17,7 @@ from jsmitsm.equation.problem import Problem
 from jsmitsm.equation.unknowns.extras import refuse_extras
 from jsmitsm.linear.linsolve import Solver
 from jsmitsm.runtime.arrays import ValueOrFunction
-from jsmitsm.runtime.errors import did_you_mean, short
+from jsmitsm.runtime.errors import did_you_mean, is_number, is_whole, short
 from jsmitsm.runtime.progress import bar
 from jsmitsm.solution.arguments import Depth, Formulation, Method
 from jsmitsm.solution.solution import Solution
@@ -204,23 +204,23 @@ def _checked(problem, make, tol, order, start, quantity, norm, max_particles, ma
             f"make: expected a function spacing -> js.Cloud, got {type(make).__name__}; write for instance "
             "lambda spacing: js.from_polygon(vertices, spacing)"
         )
-    if isinstance(tol, bool) or not isinstance(tol, (int, float, np.number)) or not 0.0 < tol < 1.0:
+    if not is_number(tol) or not 0.0 < tol < 1.0:
         raise ValueError(f"tol: expected a relative error between 0 and 1, got {short(tol)}")
-    if order != "auto" and (isinstance(order, bool) or not isinstance(order, (int, np.integer)) or order < 1):
+    if order != "auto" and not is_whole(order, 1):
         raise ValueError(f'order: expected "auto" or a whole number from 1 to {ORDERS[-1]}, got {short(order)}')
     if order != "auto" and order > ORDERS[-1]:
         raise ValueError(
             f"order: {order} leaves no higher one to estimate the error with; {ORDERS[-1]} is the highest here"
         )
     if start is not None and not callable(start):
-        if isinstance(start, bool) or not isinstance(start, (int, float, np.number)) or not 0 < start < np.inf:
+        if not is_number(start) or start <= 0:
             raise ValueError(f"start: expected a positive spacing or a function (M, D) -> (M,), got {short(start)}")
     if quantity is not None and not callable(quantity):
         raise ValueError(f"quantity: expected a function of a Solution that returns a number, got {short(quantity)}")
     if norm not in NORMS:
         raise ValueError(f"norm: {norm!r} is none of {', '.join(map(repr, NORMS))}{did_you_mean(norm, NORMS)}")
     for value, name in ((max_particles, "max_particles"), (max_rounds, "max_rounds")):
-        if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
+        if not is_whole(value, 1):
             raise ValueError(f"{name}: expected a whole number from 1, got {short(value)}")
     for name in options:
         if name in ("stencils", "kernel", "throw"):

@@ -17,8 +17,9 @@ _LONG = (3.0, 1.8)
 def simplices(cloud: Cloud) -> np.ndarray:
     """Intervals, triangles or tetrahedra (M, D + 1) between the particles, those outside of the domain dropped.
 
-    A simplex with boundary particles at all its corners lies outside where the normals point into it. Where normals
-    are missing, it is dropped if its longest edge is much longer than the usual edges of its corners.
+    A simplex with boundary particles at all its corners lies outside where the shape says so, or, where the cloud knows
+    none, where the normals point into it. Where normals are missing too, it is dropped if its longest edge is much
+    longer than the usual edges of its corners.
     Without normals the very corner of a notch may be filled, and what a particle on the very boundary sees across it.
     Those of a cloud of several regions do not cross an interface.
 
@@ -97,6 +98,11 @@ def _solid(points: np.ndarray, cells: np.ndarray) -> np.ndarray:
 def _outside(cloud: Cloud, points: np.ndarray, cells: np.ndarray) -> np.ndarray:
     """Mask of the simplices that cover a hole or a notch."""
     suspect = np.isin(cells, cloud.boundary).all(axis=1)  # an interior particle proves a simplex innocent
+    if cloud._shape is not None and cloud.dim > 1:  # at the end of a side its normal says nothing of the next one
+        out, which = np.zeros(len(cells), bool), np.flatnonzero(suspect)
+        middle = np.asarray(cloud.points)[cells[which]].mean(axis=1)
+        out[which] = cloud._shape.distance(middle)[0] > 1e-9 * np.ptp(middle) if len(which) else False
+        return out
     if cloud.normals is None:
         # A cloud without any boundary shows its holes by long simplices only.
         long = _stretch(points, cells)

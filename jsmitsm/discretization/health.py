@@ -23,6 +23,8 @@ LEBESGUE = 1.5
 # A particle with conditions of its own (a Neumann side) is one-sided by nature: short of a healthy
 # stencil a wider one costs it more accuracy than it gains, unless the old one is as bad as this.
 HOPELESS = 10.0
+# Beyond this a stencil that could not be repaired has a weight that falls less.
+POOR = 3.0
 # A moment system that misses what is asked of it by more than this does not determine it.
 DEFECT = 1e-6
 
@@ -64,8 +66,9 @@ def repaired(
 ) -> tuple[list[Class], list[Row], Health]:
     """Give weak particles wider stencils, then balanced ones; keep the healthiest found.
 
-    Tried in turn until L <= 1.5: 1.5 and 2.2 times the neighbours, then stencils with some
-    neighbours from every direction. Particles with conditions of their own take no half measures.
+    Tried in turn until L <= 1.5: 1.5 and 2.2 times the neighbours, then stencils with some neighbours from every
+    direction. Those that stay poor are tried again with a weight that falls less. Particles with conditions of their
+    own take no half measures.
     """
     new_classes, new_rows, touched = [], [], [np.zeros(0, int)]
     # The pieces of a class are repaired together.
@@ -87,12 +90,27 @@ def repaired(
     for key, found in pieces.items():
         poor = [(_some(cls, at), _take(row, at)) for cls, row, at in found if len(at)]
         if poor:
-            cls, row, changed = _repaired(disc, nums, poor, sizes[key])
-            new_classes.append(cls)
-            new_rows.append(row)
-            touched.append(changed)
+            for cls, row, changed in _parted(disc, nums, *_repaired(disc, nums, poor, sizes[key]), sizes[key]):
+                new_classes.append(cls)
+                new_rows.append(row)
+                touched.append(changed)
     after = examine(new_classes, new_rows)
     return new_classes, new_rows, replace(after, repaired=np.concatenate(touched))
+
+
+def _parted(
+    disc: Discretization, nums: Numbers, cls: Class, row: Row, changed: np.ndarray, size: int
+) -> list[tuple[Class, Row, np.ndarray]]:
+    """Repaired particles, and apart from them those that stay poor, with a weight that falls less."""
+    even, weak = replace(cls.scheme, uneven=True), _score(row) > POOR
+    if cls.scheme.n_own or even.decay == cls.scheme.decay or not weak.any():
+        return [(cls, row, changed)]
+    poor = replace(_some(cls, weak), scheme=even)
+    start = class_rows(disc, nums, poor, shared_elimination(disc, nums))
+    soft = _repaired(disc, nums, [(poor, start)], size)
+    rest = _some(cls, ~weak)
+    sound = [(rest, _take(row, ~weak), np.intersect1d(changed, rest.ids))] if len(rest.ids) else []
+    return [*sound, (soft[0], soft[1], np.union1d(soft[2], np.intersect1d(changed, poor.ids)))]
 
 
 def _repaired(

@@ -14,7 +14,7 @@ from jsmitsm.discretization.layout import Class, Discretization
 from jsmitsm.discretization.supports import default_kernel
 from jsmitsm.particle import batches
 from jsmitsm.particle.batches import Operands
-from jsmitsm.particle.elimination import Elimination, eliminate, eliminate_on_host
+from jsmitsm.particle.elimination import Elimination, Scheme, eliminate, eliminate_on_host
 from jsmitsm.particle.kernels import Kernel
 from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.runtime.whole_program import in_one_program
@@ -99,8 +99,13 @@ def shared_elimination(disc: Discretization, nums: Numbers) -> Elimination | Non
     if not (disc.traced.constant and disc.rec.scale_free):
         return None
     if is_traced(nums.jac) or isinstance(nums.jac, jax.Array):
-        return eliminate(disc.scheme, jnp.asarray(nums.jac[..., 0]), 1.0)
+        return _eliminate(disc.scheme, jnp.asarray(nums.jac[..., 0]))
     return eliminate_on_host(disc.scheme, nums.jac[..., 0])
+
+
+@partial(in_one_program, static=("scheme",))
+def _eliminate(scheme: Scheme, jac: Any) -> Elimination:
+    return eliminate(scheme, jac, 1.0)
 
 
 def right_sides(disc: Discretization, nums: Numbers, cls: Class) -> tuple[Any, Any]:

@@ -30,13 +30,14 @@ class Part:
     """A part of a cloud that several processes share: what is decided of the whole, and how they decide together.
 
     own (n,) bool: the particles whose rows are made here, the others are only looked at. even: whether the whole cloud
-    is evenly spaced; spacing: the mean one of the whole. largest: of numbers by name the largest of all parts; total:
-    the sum of an array over all parts; both are called by all of them at once.
+    is evenly spaced; spacing: the mean one of the whole; sample (m, D): some of its particles. largest: of numbers by
+    name the largest of all parts; total: the sum of an array over all parts; both are called by all of them at once.
     """
 
     own: np.ndarray
     even: bool
     spacing: float
+    sample: np.ndarray
     largest: Callable[[dict[Any, int]], dict[Any, int]]
     total: Callable[[np.ndarray], np.ndarray]
 

@@ -15,6 +15,7 @@ from jsmitsm.equation.dependence import EXTRAS, FIELD, JUMPS, POINT, Facts
 from jsmitsm.equation.field import local_field
 from jsmitsm.equation.linearizing import Record, record
 from jsmitsm.equation.traced import Traced
+from jsmitsm.runtime.collector import uncollected
 from jsmitsm.runtime.recall.recording import recalled
 from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.taylor.multi_indices import Slot
@@ -52,7 +53,9 @@ def trace(
     rest = dim, fields, tuple(extras), tree, tuple((v.shape, v.dtype, v.weak_type) for v in map(jax.typeof, leaves))
 
     def make() -> Traced:
-        return _classified(record(residual, local_field(dim, fields), extras, params), dim, fields, len(extras), tree)
+        with uncollected():
+            made = record(residual, local_field(dim, fields), extras, params)
+            return _classified(made, dim, fields, len(extras), tree)
 
     if not _is_plain(tree):
         return make()
@@ -73,14 +76,18 @@ def _holds_tracers(traced: Traced) -> bool:
     return is_traced(traced._record.consts)
 
 
-def restricted(traced: Traced, slots: Sequence[Slot], affine: bool = False) -> Traced:
-    """The same record as a residual of some of its slots alone; the others are zero.
+def restricted(traced: Traced, *chosen: tuple[Sequence[Slot], bool]) -> list[Traced]:
+    """The same record as residuals of some of its slots alone, the others zero: one for each (slots, affine).
 
     affine: the coefficients of these slots depend on no slot, and only they are wanted: a linear operator, no source.
     """
     r = traced._record
-    chosen = _classified(r, traced.dim, traced.fields, traced._n_extras, traced._params_tree, slots)
-    return replace(chosen, linear=True, source="zero", branches=None) if affine else chosen
+    facts = _facts_of(r, traced._n_extras)
+    found = []
+    for slots, affine in chosen:
+        part = _classified(r, traced.dim, traced.fields, traced._n_extras, traced._params_tree, slots, facts, affine)
+        found.append(replace(part, linear=True, source="zero") if affine else part)
+    return found
 
 
 def moving(traced: Traced, leaf: int) -> tuple[set[Slot], bool]:
@@ -100,11 +107,11 @@ def moving(traced: Traced, leaf: int) -> tuple[set[Slot], bool]:
 
 
 def _classified(
-    r: Record, dim: int, fields: int, n_extras: int, params_tree: Any, chosen: Sequence[Slot] | None = None
-) -> Traced:
+    r: Record, dim: int, fields: int, n_extras: int, params_tree: Any, chosen: Sequence[Slot] | None = None,
+    known: tuple[list[Facts], Facts] | None = None, affine: bool = False,
+) -> Traced:  # fmt: skip
     """Read off the recorded operations what kind of residual it is, of the chosen slots (None: of all)."""
-    zero = r.jaxpr.invars[0].aval.dtype.type(0)
-    facts = _facts(r, n_extras, None)
+    facts, rest = known or _facts_of(r, n_extras)
     pattern, every = np.zeros((r.n_equations, len(r.slots)), bool), 0
     for k, out in enumerate(r.outputs):
         if out is not None and (chosen is None or r.slots[k] in chosen):
@@ -116,11 +123,11 @@ def _classified(
     keep = [k for k in range(len(r.slots)) if pattern[:, k].any() or jumps and (chosen is None or r.slots[k] in chosen)]
     pattern = pattern[:, keep]
     slots = tuple(r.slots[k] for k in keep)
-    rest = _facts(r, n_extras, zero)[0]
     if (rest.known & (rest.value == 0)).all():
         source = "zero"
     else:
         source = "variable" if _bits(rest) & (POINT | EXTRAS) else "constant"
+    written = r.written, r.consts[len(r.consts) - len(r.written.constvars) :]
     return Traced(
         dim=dim,
         fields=fields,
@@ -132,7 +139,7 @@ def _classified(
         constant=linear and not every & (POINT | EXTRAS),
         source=source,
         uses_extras=bool((every | _bits(facts[0])) & EXTRAS),
-        branches=branches(r.written, r.consts[len(r.consts) - len(r.written.constvars) :], n_extras),
+        branches=None if affine else branches(*written, n_extras),
         _record=r,
         _n_extras=n_extras,
         _params_tree=params_tree,
@@ -142,6 +149,12 @@ def _classified(
 def _bits(facts: Facts) -> int:
     """What any element depends on."""
     return int(np.bitwise_or.reduce(facts.depends, axis=None)) if facts.depends.size else 0
+
+
+def _facts_of(r: Record, n_extras: int) -> tuple[list[Facts], Facts]:
+    """Facts about all outputs, and about the residual where every slot is zero."""
+    zero = r.jaxpr.invars[0].aval.dtype.type(0)
+    return _facts(r, n_extras, None), _facts(r, n_extras, zero)[0]
 
 
 def _facts(r: Record, n_extras: int, field_value: Any, moved: int | None = None) -> list[Facts]:

@@ -13,7 +13,7 @@ from jsmitsm.cloud.regions.region_cloud import RegionCloud
 from jsmitsm.equation.problem import Problem
 from jsmitsm.equation.regions.per_region import PerRegion
 from jsmitsm.equation.unknowns.extras import refuse_extras
-from jsmitsm.runtime.errors import did_you_mean, refuse_masked, short
+from jsmitsm.runtime.errors import did_you_mean, is_number, is_whole, refuse_masked, short
 from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.taylor.multi_indices import HIGHEST
 
@@ -46,16 +46,15 @@ def check(problem, cloud, t, steps, tol, order, scheme, throw, progress) -> None
             f"the error in time below so much of the solution; got steps={short(steps)}, tol={short(tol)}"
         )
     if steps is not None:
-        whole = isinstance(steps, (int, np.integer)) and not isinstance(steps, bool)
-        if not whole or not 1 <= steps <= MOST_STEPS:
+        if not is_whole(steps, 1, MOST_STEPS):
             raise ValueError(f"steps: expected a whole number from 1 to {MOST_STEPS:,}, got {short(steps)}")
     if tol is not None:
-        if isinstance(tol, bool) or not isinstance(tol, (int, float, np.number)) or not 1e-13 <= float(tol) <= 0.1:
+        if not is_number(tol) or not 1e-13 <= tol <= 0.1:
             raise ValueError(f"tol: expected a number from 1e-13 to 0.1, relative to the solution, got {short(tol)}")
     if not isinstance(scheme, str) or scheme not in SCHEMES:
         known = ", ".join(map(repr, SCHEMES))
         raise ValueError(f"scheme: {scheme!r} is none of {known}{did_you_mean(str(scheme), SCHEMES)}")
-    if isinstance(order, bool) or not isinstance(order, (int, np.integer)) or not 1 <= order <= HIGHEST:
+    if not is_whole(order, 1, HIGHEST):
         raise ValueError(f"order: expected a whole number from 1 to {HIGHEST}, got {short(order)}")
     for value, name in ((throw, "throw"), (progress, "progress")):
         if not isinstance(value, (bool, np.bool_)):
@@ -66,7 +65,7 @@ def saved_times(save: Any, t0: float, t1: float) -> np.ndarray:
     """The times to save as parts of the whole, from 0 to 1."""
     if save is None:
         return np.array([0.0, 1.0])
-    if isinstance(save, (int, np.integer)) and not isinstance(save, bool):
+    if is_whole(save):
         if save < 1:
             raise ValueError(f"save: expected at least 1 interval, or an array of times, got {save}")
         return np.linspace(0.0, 1.0, int(save) + 1)

@@ -9,11 +9,12 @@ import numpy as np
 
 from jsmitsm.evolution.estimate import estimated
 from jsmitsm.evolution.evolution import Evolution, Report
-from jsmitsm.evolution.run import Run
+from jsmitsm.evolution.run import Run, drifted
 from jsmitsm.evolution.space.local_fits import StateFit
 from jsmitsm.evolution.space.semidiscrete import local_fits
 from jsmitsm.evolution.steps import dense_output
 from jsmitsm.evolution.steps.control import controlled
+from jsmitsm.evolution.steps.in_time import InTime, looks
 from jsmitsm.evolution.steps.stepping import Step, Stopped
 from jsmitsm.runtime.errors import SolveError
 from jsmitsm.solution.fit import Recipe
@@ -23,8 +24,6 @@ from jsmitsm.taylor.multi_indices import HIGHEST
 HISTORY = 2**29
 # Growth of the largest value that no problem means.
 BLOWN = 1e30
-# Steps of a run with equal ones whose error in time is estimated.
-LOOKS = 8
 # An estimated error in time above this part of the solution is a flag.
 LARGE = 0.02
 
@@ -38,6 +37,7 @@ class History:
         self.states: list[np.ndarray] = []
         self.rates: list[np.ndarray] = []
         self.scale = 0.0
+        self.in_time = InTime()
 
     def add(self, t: float, step: Step, number: int | None = None) -> None:
         semi = self.run.semi
@@ -65,19 +65,19 @@ def march(run: Run, steps: int | None, tol: float | None, parts: np.ndarray, sho
         wanted = np.zeros(steps + 1, bool)
         wanted[dense_output.weights(np.linspace(0.0, 1.0, steps + 1), parts)[0]] = True
     history = History(run, wanted)
-    fault, errors = "", []
+    fault = ""
     try:
         y = started(run, (t1 - t0) / (steps or 64))
         if steps is None:
             assert tol is not None
             _adaptive(run, y, t0, t1, tol, history, shown)
         else:
-            errors = _equal(run, y, np.linspace(t0, t1, steps + 1), history, shown)
+            _equal(run, y, np.linspace(t0, t1, steps + 1), history, shown)
     except Stopped as stopped:
         fault = str(stopped)
     if fault and run.throw:
         raise SolveError(f"the run stopped: {fault}; give throw=False for the last good state", [])
-    return _finished(run, parts, history, fault, errors, began)
+    return _finished(run, parts, history, fault, began)
 
 
 def started(run: Run, h: float) -> np.ndarray:
@@ -113,28 +113,31 @@ def started_raw(run: Run) -> np.ndarray:
     return np.concatenate([np.asarray(v).reshape(-1)[run.semi.free] for v in run.start])
 
 
-def _equal(run: Run, y: np.ndarray, times: np.ndarray, history: History, shown: Any) -> list[float]:
-    """Equal steps; the estimated errors of some of them, relative to the solution."""
+def _equal(run: Run, y: np.ndarray, times: np.ndarray, history: History, shown: Any) -> None:
+    """Equal steps."""
     h = float(times[-1] - times[0]) / (len(times) - 1)
     stepper = run.stepper(run.semi)
     stepper.drive.plan(times[:-1], h)
     step = stepper.first(y, float(times[0]))
     history.add(float(times[0]), step, 0)
-    looks = {round(k) for k in np.linspace(0, len(times) - 2, LOOKS)}
-    errors = []
+    wanted = looks(len(times) - 1)
     for k in range(len(times) - 1):
-        if run.timed.quasilinear and run.drifted(step.y, float(times[k])):
+        if run.timed.quasilinear and _left(run, step, float(times[k])):
             run.renew(step.y, float(times[k]))
             stepper = run.stepper(run.semi)
             step = stepper.first(step.y, float(times[k]))
-        step = _one(run, stepper, step, float(times[k]), h, k in looks)
+        step = _one(run, stepper, step, float(times[k]), h, k in wanted)
         history.add(float(times[k + 1]), step, k + 1)
-        if step.error is not None:
-            errors.append(_size(run, step.error, history.scale))
+        if k in wanted:
+            history.in_time.add(stepper, step, float(times[k + 1]), h, wanted[k])
         _refuse_growth(history, step, float(times[k + 1]))
         run.counts["steps"] += 1
         shown.update()
-    return errors
+
+
+def _left(run: Run, step: Step, t: float) -> bool:
+    """Whether the pencil is to be made anew."""
+    return drifted(run.semi, run.semi.placed(step.y[: run.semi.system.n], step.known), t)
 
 
 def _one(run: Run, stepper: Any, step: Step, t: float, h: float, look: bool) -> Step:
@@ -170,8 +173,14 @@ def _adaptive(run: Run, y: np.ndarray, t0: float, t1: float, tol: float, history
         done = new
 
     stepper: Any = _Renewing(run)
+
+    def added(t: float, step: Step) -> None:
+        if history.times:
+            history.in_time.add(stepper.inner, step, t, stepper.h)
+        history.add(t, step)
+
     counts = controlled(
-        stepper, y, t0, t1, tol, lambda t, step: history.add(t, step), tell,
+        stepper, y, t0, t1, tol, added, tell,
         lambda error: _size(run, error, history.scale),
     )  # fmt: skip
     run.counts.update(counts)
@@ -182,23 +191,22 @@ class _Renewing:
 
     def __init__(self, run: Run):
         self.run, self.inner = run, run.stepper(run.semi)
-        self.order = self.inner.order
+        self.order, self.h = self.inner.order, 0.0
 
     def first(self, y: np.ndarray, t: float) -> Step:
         return self.inner.first(y, t)
 
     def advance(self, last: Step, t: float, h: float, estimate: bool) -> Step:
         run = self.run
-        if run.timed.quasilinear and run.drifted(last.y, t):
+        if run.timed.quasilinear and _left(run, last, t):
             run.renew(last.y, t)
             self.inner = run.stepper(run.semi)
             last = self.inner.first(last.y, t)
+        self.h = h
         return self.inner.advance(last, t, h, estimate)
 
 
-def _finished(
-    run: Run, parts: np.ndarray, history: History, fault: str, errors: list[float], began: float
-) -> Evolution:
+def _finished(run: Run, parts: np.ndarray, history: History, fault: str, began: float) -> Evolution:
     t0, t1 = (float(v) for v in run.t)
     times = np.where(parts >= 1.0, t1, t0 + parts * (t1 - t0))
     flags, told = run.flags, run.told
@@ -216,8 +224,8 @@ def _finished(
     else:
         states = history.at(times, history.states)
         rates = history.at(times, history.rates) if run.second else None
-    # Errors of the steps add up at the worst.
-    in_time = float(np.mean(errors)) * run.counts["steps"] if errors else None
+    later = history.in_time.at(times)
+    in_time = float(later.max()) / (history.scale or 1.0) if history.in_time.times else None
     if in_time is not None and in_time > LARGE:
         flags.append(f"The estimated error in time is {in_time:.0%} of the solution: take more steps, or a tol.")
     stats = _statistics(run, began, in_time)
@@ -226,7 +234,8 @@ def _finished(
     recipe = Recipe("S", run.order, None, "loo", run.fields, degree - run.order)
     fit = StateFit(run.cloud, degree, lambda: local_fits(disc, degree))
     kept = np.array(history.times), np.stack(history.states)
-    report = Report(flags, told, lambda: estimated(run, np.asarray(times), kept, in_time))
+    moved = np.stack(history.rates) if history.rates else None
+    report = Report(flags, told, lambda: estimated(run, np.asarray(times), kept, moved, later))
     return Evolution(times, states, rates, run.cloud, recipe, not fault, stats, kept, report, fit)
 
 

@@ -6,6 +6,7 @@ import time
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm.cloud.cloud import Cloud
@@ -18,7 +19,8 @@ from jsmitsm.evolution.space.semidiscrete import Driver, Semidiscrete, local_fit
 from jsmitsm.evolution.space.timed import Timed
 from jsmitsm.evolution.steps.newton import Newton
 from jsmitsm.evolution.steps.stepping import RadauStepper, Stepper
-from jsmitsm.evolution.steps.tableaux import EULER, KENCARP4, RADAU
+from jsmitsm.evolution.steps.tableaux import EULER, KENCARP4, RADAU, Additive, Radau
+from jsmitsm.runtime.errors import is_number
 from jsmitsm.runtime.tracers import is_traced
 
 # A quasilinear problem is linearised anew where its coefficients have changed by this part of themselves.
@@ -43,12 +45,7 @@ class Run:
         self._fits: Any = None
         self.name = self._scheme(scheme)
         self.damping = self._damping(damping)
-        if self.traced and (timed.quasilinear or self.name == "radau"):
-            raise ValueError(
-                'scheme: under a JAX transform js.evolve steps linear problems by "esdirk" and "euler", and by "imex" '
-                "those where only lower derivatives are nonlinear; others it does not do there"
-            )
-        self.semi = self.pencil(np.asarray(0.0) if self.traced else np.asarray(float(t[0])), start[0])
+        self.semi = self.pencil(t[0] if is_traced(t[0]) else np.asarray(float(t[0])), start[0])
 
     # ------------------------------------------------------------------ what is chosen
 
@@ -83,7 +80,7 @@ class Run:
         if asked != "auto":
             return asked
         if timed.linear:
-            return "radau" if (self.order >= 6 or self.second or self.algebraic) and not self.traced else "esdirk"
+            return "radau" if self.order >= 6 or self.second or self.algebraic else "esdirk"
         return "esdirk" if timed.quasilinear or self.algebraic else "imex"
 
     def _damping(self, asked: Any) -> float:
@@ -99,8 +96,7 @@ class Run:
             else:
                 alpha = 0.2 if coupled and max(operator.order) >= 2 and not self.algebraic else 0.0
         else:
-            good = isinstance(asked, (int, float, np.number)) and not isinstance(asked, bool)
-            if not good or not 0 <= float(asked) < np.inf:
+            if not is_number(asked) or asked < 0:
                 raise ValueError(f'damping: expected "auto" or a number from 0, got {asked!r}')
             alpha = float(asked)
         if not alpha or is_traced(self.cloud.points):
@@ -129,7 +125,8 @@ class Run:
             rec = pencil.layout.disc.rec
             slots = slot_series(rec, timed.space.slots, taylor, 0)
             jac, _ = timed.space.coefficients(self.cloud.points, 0, params=problem.params, slots=slots)
-            reference = np.broadcast_to(jac[:, :, 0], (self.fields, len(timed.space.slots), len(self.cloud)))
+            xp = jnp if is_traced(jac) else np
+            reference = xp.broadcast_to(jac[:, :, 0], (self.fields, len(timed.space.slots), len(self.cloud)))
         semi = Semidiscrete(timed, pencil, self.params, self.damping, reference)
         if not self.traced:
             refuse_convection(semi, self.flags)
@@ -144,29 +141,36 @@ class Run:
             self._fits = local_fits(disc, disc.rec.reach)
         return self._fits.coefficients(u)
 
-    def drifted(self, y: Any, t: float) -> bool:
-        """Whether the coefficients have left those that the pencil was made with."""
-        semi, record = self.semi, self.timed.space
-        assert semi.reference is not None
-        change = semi.steepness(semi.lifted(y, np.asarray(t)), t)
-        for e, m in enumerate(record.order):
-            top = [s for s, (_, b) in enumerate(record.slots) if record.pattern[e, s] and sum(b) == m]
-            size = np.sqrt((semi.reference[e, top] ** 2).sum(axis=0))
-            if (np.abs(change[e, top]).max(axis=0) > DRIFT * size).any():
-                return True
-        return False
-
-    def renew(self, y: Any, t: float) -> None:
+    def renew(self, y: Any, t: Any) -> None:
         """The pencil linearised at a later state."""
-        self.semi = self.pencil(np.asarray(t), self.semi.lifted(y, np.asarray(t)))
+        t = t if is_traced(t) else np.asarray(float(t))
+        self.semi = self.pencil(t, self.semi.lifted(y, t))
+
+    @property
+    def scheme(self) -> Additive | Radau:
+        """The coefficients of its scheme."""
+        if self.name == "radau":
+            return RADAU
+        return EULER if self.name == "euler" else KENCARP4
 
     def stepper(self, semi: Semidiscrete) -> Any:
-        consistent = not semi.second
-        if self.name == "radau":
-            return RadauStepper(semi.system, Driver(semi, RADAU.sampling(consistent)))
-        scheme = EULER if self.name == "euler" else KENCARP4
+        """What makes its steps."""
+        drive, scheme = Driver(semi, self.scheme.sampling(not semi.second)), self.scheme
+        if isinstance(scheme, Radau):
+            return RadauStepper(semi.system, drive)
         explicit = None if semi.linear else semi.explicit
         if self.name != "imex" and explicit is not None:
             self.newton = Newton(semi)
-        return Stepper(semi.system, Driver(semi, scheme.sampling(consistent)), scheme, explicit,
-                       None if self.name == "imex" else self.newton)  # fmt: skip
+        return Stepper(semi.system, drive, scheme, explicit, None if self.name == "imex" else self.newton)
+
+
+def drifted(semi: Semidiscrete, u: Any, t: float) -> bool:
+    """Whether the coefficients at the values u (N, F) have left those that the pencil was made with."""
+    record, reference = semi.timed.space, semi.reference
+    change = semi.steepness(u, t)
+    for e, m in enumerate(record.order):
+        top = [s for s, (_, b) in enumerate(record.slots) if record.pattern[e, s] and sum(b) == m]
+        size = np.sqrt((reference[e, top] ** 2).sum(axis=0))
+        if (np.abs(change[e, top]).max(axis=0) > DRIFT * size).any():
+            return True
+    return False

@@ -86,6 +86,7 @@ class Factor:
         rows, cols = np.asarray(rows), np.asarray(cols)
         self.n, self.refine = n, refine
         self._lu: Any = None
+        self._trusted = {False: False, True: False}
         self._lock = threading.RLock()  # a backend may change during a solve
         self.messages: list[str] = []
         self.info: dict[str, Any] = {
@@ -147,6 +148,20 @@ class Factor:
         x[:, ~finite] = np.nan
         self.info["seconds"]["solve"] = time.perf_counter() - started
         return x.reshape(b.shape)
+
+    def plain(self, b: np.ndarray, transpose: bool = False) -> np.ndarray:
+        """``solve`` for one of many finite right-hand sides (n,): residuals are looked at of the first alone.
+
+        A direct solver that has solved one backward stably solves all; iterative ones are looked at every time.
+        """
+        if not self._trusted[transpose] or self._backends[0] in ITERATIVE:
+            x = self.solve(b, transpose)
+            self._trusted[transpose] = bool(b.any())
+            return x
+        before, after = (self.col_scale, self.row_scale) if transpose else (self.row_scale, self.col_scale)
+        right = before * b
+        x = self._lu.apply((right if self.order is None else right[self.order])[:, None], transpose)
+        return after * self._in_callers_order(x[:, 0])
 
     def condition(self) -> float:
         """Condition number in the 1-norm, of the matrix with rows and columns scaled to about one.

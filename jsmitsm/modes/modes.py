@@ -15,7 +15,7 @@ from jsmitsm.modes.estimate import errors
 from jsmitsm.modes.question import Question, mass_at
 from jsmitsm.modes.spectrum import Pairs
 from jsmitsm.runtime.arrays import Array, ArrayLike
-from jsmitsm.runtime.errors import short, some
+from jsmitsm.runtime.errors import explained, short, some
 from jsmitsm.runtime.tracers import frozen, is_traced, owned
 from jsmitsm.solution.fit import Fit, Recipe
 from jsmitsm.solution.solution import Solution
@@ -234,7 +234,7 @@ class Modes:
         """The largest entry (k,) of A u - lambda B mass u, relative to the sum of the sizes of its terms."""
         found = self._host("residuals")
         q = self._known("residuals")
-        a, b = (m.to_scipy()[q.pencil.free][:, q.pencil.free] for m in (q.pencil.A, q.pencil.B))
+        a, b = (m.host[q.pencil.free][:, q.pencil.free] for m in (q.pencil.A, q.pencil.B))
         weighted = np.asarray(q.weights).reshape(-1)[q.pencil.free][:, None] * found.right
         rest = np.abs(a @ found.right - (b @ weighted) * found.values).max(axis=0)
         return rest / (abs(a) @ np.abs(found.right)).max(axis=0)
@@ -306,13 +306,13 @@ class Modes:
                 "times, since the operator is far from self-adjoint, as strong convection makes it: the error estimate "
                 "says little; write u = exp(b . x / 2) v for a drift b, or compare with a finer cloud."
             )
-        return out
+        return explained(out)
 
     def _conditions(self) -> np.ndarray:
         """The condition numbers (k,) of the values: the sizes of both vectors where their product is one."""
         found, q = self._host("flags"), self._known("flags")
         weighted = np.asarray(q.weights).reshape(-1)[q.pencil.free][:, None]
-        dual = weighted * (q.pencil.B.to_scipy()[q.pencil.free][:, q.pencil.free].T @ found.left)
+        dual = weighted * (q.pencil.B.host[q.pencil.free][:, q.pencil.free].T @ found.left)
         return np.linalg.norm(found.right, axis=0) * np.linalg.norm(dual, axis=0)
 
     def _part(self) -> np.ndarray:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from jsmitsm.discretization.leave_one_out import matrix, right_side
+from jsmitsm.discretization.resolution.digits import room
 from jsmitsm.parallel.local import Local, Settings
 from jsmitsm.parallel.solution import ParallelSolution
 from jsmitsm.parallel.team import Team
@@ -45,7 +46,10 @@ def error_estimate(sol: ParallelSolution) -> np.ndarray:
             raise ValueError("error_estimate: made for method S alone on several processes; use js.solve")
         if order > HIGHEST:
             raise ValueError(f"error_estimate: needs expansions of order {order}, and {HIGHEST} is the highest")
-    high = Local(us, low.problem, low.mine, Settings("S", order, sol._recipe.depth, None, True, "loo"))
+    with us.phase():
+        disc = low.disc
+        most = room(disc.rec, order, disc.traced, low.cloud, disc.problem.params, low.part)
+    high = Local(us, low.problem, low.mine, Settings("S", order, min(disc.rec.depth, most), None, True, "loo"))
     high_nums, *high_rows = high.rows()
     values = np.zeros((len(high.halo), sol._recipe.fields))
     values[high.halo.ids] = sol._values[low.halo.ids]

@@ -16,6 +16,7 @@ from jsmitsm.cloud.neighbours import EVEN_SAMPLE, Stencils, is_even, kept_distan
 from jsmitsm.discretization.coefficients import Numbers, numbers
 from jsmitsm.discretization.layout import Class, discretize, sorted_classes, table
 from jsmitsm.discretization.operator_kind import prefers_least_squares
+from jsmitsm.discretization.resolution.digits import LOOKED_AT
 from jsmitsm.discretization.rows import all_coefficients
 from jsmitsm.discretization.supports import Part
 from jsmitsm.equation.bcs import Condition
@@ -69,7 +70,7 @@ class Local:
         halo, s = self.halo, self.settings
         with self.team.phase(halo.slab.number):
             even = self._even()
-            self.part = Part(halo.own, even, self._spacing(), self.team.largest, self.team.total)
+            self.part = Part(halo.own, even, self._spacing(), self._sample(), self.team.largest, self.team.total)
             cloud = halo.slab.cloud()
             kernel = s.kernel and local_kernel(s.kernel, halo.slab)
             local = local_problem(self.problem, halo.slab)
@@ -95,6 +96,14 @@ class Local:
         at = self.halo.ids[np.isin(slab.number[self.halo.ids], sample)]
         kept = kept_distances(slab.points, slab.points[at]) if len(at) else np.zeros(0)
         return is_even(np.concatenate(self.team.gather(kept)))
+
+    def _sample(self) -> np.ndarray:
+        """The particles by which one process judges the coefficients."""
+        step = max(1, self.mine.count // LOOKED_AT)
+        some = self.mine.number % step == 0
+        found = self.team.gather((self.mine.number[some], self.mine.points[some]))
+        number, points = (np.concatenate(parts) for parts in zip(*found))
+        return points[np.argsort(number)]
 
     def _spacing(self) -> float:
         low, high = np.min([a for a, _ in self.boxes], axis=0), np.max([b for _, b in self.boxes], axis=0)

@@ -55,8 +55,8 @@ class Team:
     def largest(self, numbers: dict[Any, Any]) -> dict[Any, Any]:
         """Of numbers by name the largest of all processes."""
         out: dict[Any, Any] = {}
-        for some in self.gather(numbers):
-            for name, value in some.items():
+        for mine in self.gather(numbers):
+            for name, value in mine.items():
                 out[name] = max(value, out.get(name, value))
         return out
 

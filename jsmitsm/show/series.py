@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from jsmitsm.cloud.triangulation import simplices
+from jsmitsm.runtime.errors import is_whole
 from jsmitsm.show import drawing
 from jsmitsm.show.mesh_files import needed
 
@@ -52,7 +53,7 @@ def animate(run: Any, *, field: int = 0, frames: int | None = None, interval: fl
     cloud = _evolution(run).cloud
     if cloud.dim == 3:
         raise ValueError("run: moving pictures are of one or two dimensions; js.files.to_pvd writes those of three")
-    if frames is not None and (isinstance(frames, bool) or not isinstance(frames, (int, np.integer)) or frames < 1):
+    if frames is not None and not is_whole(frames, 1):
         raise ValueError(f"frames: expected a number of moments, got {frames!r}")
     from matplotlib.animation import FuncAnimation
 

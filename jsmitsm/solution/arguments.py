@@ -14,7 +14,7 @@ from jsmitsm.equation.problem import Problem
 from jsmitsm.equation.regions.per_region import PerRegion
 from jsmitsm.linear.linsolve import SOLVERS, Solver
 from jsmitsm.particle.kernels import Kernel
-from jsmitsm.runtime.errors import did_you_mean, refuse_masked, short
+from jsmitsm.runtime.errors import did_you_mean, is_whole, refuse_masked, short
 from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.taylor.multi_indices import HIGHEST
 
@@ -93,7 +93,7 @@ def check(
     if not isinstance(throw, (bool, np.bool_)):
         raise ValueError(f"throw: expected True or False, got {short(throw)}")
     _check_start(u0, (len(cloud), problem.fields))
-    if isinstance(order, bool) or not isinstance(order, (int, np.integer)) or not 1 <= order <= HIGHEST:
+    if not is_whole(order, 1, HIGHEST):
         raise ValueError(
             f"order: expected a whole number from 1 to {HIGHEST}, the degree of the expansions, got {short(order)}"
         )

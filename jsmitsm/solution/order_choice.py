@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from jsmitsm.runtime.errors import SolveError, short
+from jsmitsm.runtime.errors import SolveError, is_number, short
 from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.solution.solution import Solution
 
@@ -20,7 +20,7 @@ _GAIN, _IDLE = 0.7, 2
 def check_tolerance(order: Any, tol: Any) -> None:
     """``tol`` and ``order="auto"`` come together."""
     if isinstance(order, str) and order == "auto":
-        if isinstance(tol, bool) or not isinstance(tol, (int, float, np.number)) or not 0.0 < tol < 1.0:
+        if not is_number(tol) or not 0.0 < tol < 1.0:
             raise ValueError(
                 f'tol: order="auto" needs the wanted error, relative to the largest |u|, from 0 to 1, got {short(tol)}'
             )

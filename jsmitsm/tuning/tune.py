@@ -19,7 +19,7 @@ from jsmitsm.discretization.supports import default_kernel
 from jsmitsm.equation.problem import Problem
 from jsmitsm.particle.kernels import Kernel
 from jsmitsm.runtime.arrays import ArrayLike, ValueOrFunction
-from jsmitsm.runtime.errors import did_you_mean
+from jsmitsm.runtime.errors import did_you_mean, is_whole
 from jsmitsm.runtime.progress import bar
 from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.solution.arguments import SolveOptions, check, discretized
@@ -215,7 +215,7 @@ def _check_input(problem, cloud, kernel, objective, optimizer, steps, options) -
                          + did_you_mean(objective, ["estimate"]))  # fmt: skip
     if optimizer is not None and not (hasattr(optimizer, "init") and hasattr(optimizer, "update")):
         raise ValueError(f"optimizer: expected an optax transformation such as optax.adam(0.1), got {optimizer!r}")
-    if isinstance(steps, bool) or not isinstance(steps, (int, np.integer)) or steps < 0:
+    if not is_whole(steps, 0):
         raise ValueError(f"steps: expected a whole number, 0 or more, got {steps!r}")
 
 

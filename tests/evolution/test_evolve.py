@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 import jsmitsm as js
+from jsmitsm.discretization.pencil import assemble
+from jsmitsm.evolution.gradient import adjoint
 
 ROD = js.interval(0.0, 1.0, 17)
 SQUARE = js.rectangle((0.0, 0.0), (1.0, 1.0), (9, 9), jitter=0.2)
@@ -273,6 +275,34 @@ def test_the_error_estimate_bounds_the_error_and_is_no_larger_than_it_must():
     assert found.shape == run.u.shape and error / 3 < found[-1].max() < 100 * error + 1e-7
 
 
+def test_errors_of_the_past_are_estimated_too():
+    """A cloud that was carried along and is wide by now was sharp before, and its error then is still there."""
+    exact = lambda x, t: jnp.exp(-((x[0] - 0.3 - 0.5 * t) ** 2) / (0.08 * (t + 0.5))) / jnp.sqrt(t + 0.5)  # noqa: E731
+    cloud = js.interval(0.0, 1.0, 33)
+    problem = js.Problem(lambda u, x, t: js.dt(u)(x) + 0.5 * js.grad(u)(x)[0] - 0.02 * js.laplacian(u)(x),
+                         everywhere(cloud, js.dirichlet(exact)))  # fmt: skip
+    run = js.evolve(problem, cloud, lambda x: exact(x, 0.0), t=(0.0, 0.6), steps=40)
+    error = np.abs(run.u[-1] - at(exact, cloud, 0.6)).max()
+    assert error / 2 < run.error_estimate()[-1].max() < 20 * error
+
+
+def test_a_pencil_serves_the_next_run(monkeypatch):
+    """Another source and other values, the same operator: nothing is laid out again."""
+    cloud, made = js.interval(0.0, 1.0, 21), []
+    plain = assemble.laid_out
+    monkeypatch.setattr(assemble, "laid_out", lambda *given: made.append(1) or plain(*given))
+
+    def run(rate, s):
+        problem = js.Problem(lambda u, x, t: js.dt(u)(x) - rate * js.laplacian(u)(x) - s,
+                             everywhere(cloud, js.dirichlet(s)))  # fmt: skip
+        return js.evolve(problem, cloud, s, (0.0, 1.0), steps=5).u
+
+    first = run(1.0, 1.0)
+    assert np.abs(run(1.0, 2.0) - 2 * first).max() < 1e-12 and len(made) == 1
+    run(2.0, 1.0)
+    assert len(made) == 2
+
+
 def test_a_run_goes_on_where_it_was_left():
     half = moving_heat(steps=20)
     problem = js.Problem(heat(smooth), everywhere(ROD, js.dirichlet(smooth)))
@@ -323,13 +353,24 @@ def slope(f, p, way, eps=1e-4):
     return (8 * (moved(eps) - moved(-eps)) - moved(2 * eps) + moved(-2 * eps)) / (12 * eps)
 
 
-@pytest.mark.parametrize("made", [hot, reacting])
-def test_gradients_are_those_of_differences(made):
+def spreading(p):
+    """Quasilinear: the pencil is made anew on the way."""
+    return js.Problem(
+        lambda u, x, t, p: js.dt(u)(x) - js.divergence(lambda y: (1 + p["k"] * u(y) ** 2) * js.grad(u)(y))(x)
+        - p["s"] * jnp.sin(x[0] + t),
+        {"left": js.dirichlet(lambda x, t, p: p["b"] * (1 + 2 * t)), "right": js.neumann(lambda x, t, p: p["b"])},
+        params=p,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(("made", "scheme"), [
+    (hot, "esdirk"), (hot, "radau"), (reacting, "imex"), (reacting, "esdirk"), (spreading, "esdirk"),
+])  # fmt: skip
+def test_gradients_are_those_of_differences(made, scheme):
     """By everything at once: the operator, the source, the conditions, the start and the end."""
     def total(p):
         start = lambda x: p["b"] + 0.1 * p["a"] * x[0]  # noqa: E731
-        run = js.evolve(made(p), ROD, start, t=(0.0, p["end"]), steps=8, save=2,
-                        scheme="esdirk" if made is hot else "auto")  # fmt: skip
+        run = js.evolve(made(p), ROD, start, t=(0.0, p["end"]), steps=8, save=2, scheme=scheme)
         return jnp.sum(run.u[-1] ** 2) + run.u[1, 5]
 
     p = {"k": 0.3, "s": 0.7, "b": 0.5, "a": 0.4, "end": 0.6}
@@ -339,6 +380,33 @@ def test_gradients_are_those_of_differences(made):
     assert abs(value - total(p)) < 1e-10
     along = sum(found[name] * way[name] for name in p)
     assert abs(along - slope(total, p, way)) < 1e-7 * abs(along)
+
+
+def test_the_way_back_makes_its_stages_anew_where_they_do_not_fit(monkeypatch):
+    def total(k, scheme):
+        return jnp.sum(js.evolve(hot({"k": k, "s": 0.7, "b": 0.5}), ROD, 0.2, (0.0, 0.5), steps=4, scheme=scheme).u[-1])
+
+    for scheme in ("esdirk", "radau"):
+        kept = jax.grad(total)(jnp.asarray(0.3), scheme)
+        with monkeypatch.context() as patch:
+            patch.setattr(adjoint, "TAPE", 0)
+            assert abs(jax.grad(total)(jnp.asarray(0.3), scheme) - kept) < 1e-13 * abs(kept)
+
+
+def test_gradients_by_positions():
+    cloud = js.interval(0.0, 1.0, 13)
+    near = js.stencils(cloud, size=13)
+
+    def total(moved):
+        points = jnp.asarray(cloud.points).at[5, 0].add(moved).at[8, 0].add(-0.5 * moved)
+        placed = js.Cloud(points, cloud.groups, cloud.normals)
+        problem = js.Problem(lambda u, x, t: js.dt(u)(x) - js.laplacian(u)(x) - jnp.sin(3 * x[0] + t),
+                             everywhere(cloud, js.dirichlet(0.0)))  # fmt: skip
+        run = js.evolve(problem, placed, lambda x: x[0] * (1 - x[0]), (0.0, 0.1), steps=4, stencils=near)
+        return jnp.sum(run.u[-1] ** 2)
+
+    found = jax.grad(total)(jnp.asarray(0.01))
+    assert abs(found - slope(total, jnp.asarray(0.01), 1.0)) < 1e-7 * abs(found)
 
 
 def test_jit_and_vmap():

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jsmitsm.evolution.space.matrices import Sparse
+from jsmitsm.discretization.pencil.sparse import Sparse
 from jsmitsm.evolution.space.system import System
 from jsmitsm.evolution.steps import dense_output
 from jsmitsm.evolution.steps.control import controlled

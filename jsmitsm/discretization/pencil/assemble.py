@@ -16,8 +16,10 @@ from jsmitsm.cloud.neighbours import Stencils
 from jsmitsm.discretization.coefficients import Numbers, numbers
 from jsmitsm.discretization.layout import Class, Discretization, discretize
 from jsmitsm.discretization.local_data import shared_elimination
+from jsmitsm.discretization.pencil import kept
 from jsmitsm.discretization.pencil.grades import Fitness, graded, told
 from jsmitsm.discretization.pencil.local import Part, part_of, source_stencil_size, source_stencils
+from jsmitsm.discretization.pencil.sparse import Sparse
 from jsmitsm.equation.problem import Problem
 from jsmitsm.runtime.errors import SolveError, some
 from jsmitsm.runtime.tracers import concrete, is_traced
@@ -29,33 +31,11 @@ _DEPTH = {1: 2, 2: 2, 3: 0}
 _NUMBERS = ("jac", "source", "own", "given", "held", "data", "gamma")
 
 
-@partial(jax.tree_util.register_dataclass, data_fields=["values", "rows", "cols"], meta_fields=["shape"])
-@dataclass
-class Sparse:
-    """A sparse matrix by its entries (nnz,) and their places; entries at one place add up. The values may be traced."""
-
-    values: Any
-    rows: np.ndarray
-    cols: np.ndarray
-    shape: tuple[int, int]
-
-    def to_scipy(self) -> Any:
-        """The matrix in scipy's CSR format."""
-        from scipy.sparse import csr_matrix
-
-        return csr_matrix((np.asarray(self.values), (self.rows, self.cols)), self.shape)
-
-    def __matmul__(self, x: Any) -> Any:
-        """A x for x (n,) or (n, m), differentiable."""
-        terms = (self.values if jnp.ndim(x) == 1 else self.values[:, None]) * jnp.asarray(x)[self.cols]
-        return jnp.zeros((self.shape[0], *jnp.shape(x)[1:]), terms.dtype).at[self.rows].add(terms)
-
-
 class Layout:
     """What of a pencil is static: who the neighbours are, and what was found when they were chosen."""
 
     def __init__(
-        self, disc: Discretization, classes: Sequence[tuple[Class, np.ndarray | None]], fitness: Fitness | None
+        self, disc: Any, classes: Sequence[tuple[Class, np.ndarray | None]], fitness: Fitness | None
     ):
         self.disc, self.classes, self.fitness = disc, classes, fitness
 
@@ -124,7 +104,14 @@ def assemble_pencil(
         )
     nums = numbers(disc, disc.problem, taylor)
     massed = np.ones(problem.fields, bool) if mass is None else np.asarray(mass, bool)
-    return pencil_of(*laid_out(disc, nums, massed), nums)
+    made = kept.found(disc, nums, massed)
+    if made is not None:
+        layout = Layout(disc, made.layout.classes, made.layout.fitness)
+        return replace(made, held_values=nums.held, conditions=condition_values(nums), layout=layout)
+    made = pencil_of(*laid_out(disc, nums, massed), nums)
+    layout = Layout(None, made.layout.classes, made.layout.fitness)  # without the cloud, which must not live by it
+    kept.keep(disc, nums, massed, replace(made, held_values=None, conditions=None, layout=layout))
+    return made
 
 
 def _narrowest(stencils: Stencils) -> int:

@@ -2,31 +2,66 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm.evolution.evolution import Evolution
-from jsmitsm.evolution.gradient.adjoint import Inputs, Plan, states
-from jsmitsm.evolution.gradient.pushing import Pushing
-from jsmitsm.evolution.run import Run
+from jsmitsm.evolution.gradient.adjoint import Plan, states
+from jsmitsm.evolution.gradient.inputs import Inputs, Push
+from jsmitsm.evolution.run import Run, drifted
+from jsmitsm.evolution.space.semidiscrete import Semidiscrete
 from jsmitsm.evolution.steps import dense_output
-from jsmitsm.evolution.steps.tableaux import EULER, KENCARP4
+from jsmitsm.evolution.steps.tableaux import Additive, Radau
 from jsmitsm.runtime.tracers import is_traced
+from jsmitsm.runtime.whole_program import in_one_program
 from jsmitsm.solution.fit import Recipe
 from jsmitsm.taylor.multi_indices import HIGHEST
 
 
 def differentiable(run: Run, steps: int, parts: np.ndarray) -> Evolution:
-    """The Evolution of a run with traced values, in equal steps."""
-    semi = run.semi
-    scheme = EULER if run.name == "euler" else KENCARP4
-    sampling = scheme.sampling(not semi.second)
+    """The Evolution of a run with traced values, in equal steps.
+
+    Where the pencil of a quasilinear problem is made anew on the way, the operation ends and another one begins.
+    """
+    scheme = run.scheme
     t0, t1 = (jnp.asarray(v, float) for v in run.t)
     h = (t1 - t0) / steps
+    m = len(scheme.sampling(not run.second).nodes) - 1
+    known, done, y, fresh = [], 0, None, True
+    found: list[Any] = []
+    while done < steps:
+        semi = run.semi
+        samples, given = _inputs(run, semi, scheme, t0, h, done, steps - done, y)
+        renewed = drifted if semi.reference is not None else None
+        newton = not semi.linear and run.name != "imex"
+        plan = Plan(semi, scheme, newton, steps - done, is_traced(run.t), run.throw, renewed, fresh)
+        out = states(plan, given)
+        made = len(out) - 1
+        found.append(out if not found else out[1:])
+        last = slice(None) if done + made == steps else slice(0, made * m)
+        known.append([v[:, last] for v in samples])
+        done, y, fresh = done + made, out[-1], True
+        if done < steps:
+            run.renew(y, t0 + h * done)
+    samples = [jnp.concatenate(v, axis=1) for v in zip(*known)]
+    u, rates = _saved(run.semi, parts, steps, m, jnp.concatenate(found), samples)
+    recipe = Recipe("S", run.order, None, "loo", run.fields, min(2, HIGHEST - run.order))
+    finite = jnp.isfinite(u).all()
+    good = finite if is_traced(finite) else bool(finite)
+    stats = {"scheme": "Radau IIA 5" if isinstance(scheme, Radau) else scheme.name, "steps": steps}
+    return Evolution(t0 + (t1 - t0) * parts, u, rates, run.cloud, recipe, good, stats)
+
+
+def _inputs(
+    run: Run, semi: Semidiscrete, scheme: Additive | Radau, t0: Any, h: Any, done: int, steps: int, y: Any
+) -> tuple[list[Any], Inputs]:
+    """Samples at the nodes of so many steps, and all that drives them; y: None at the start."""
+    sampling = scheme.sampling(not semi.second)
     m, s = len(sampling.nodes) - 1, len(sampling.stages)
-    places = np.append((np.arange(steps)[:, None] + sampling.nodes[:-1]).reshape(-1), steps)
+    places = np.append((np.arange(steps)[:, None] + sampling.nodes[:-1]).reshape(-1), steps) + done
     times = t0 + h * places
     samples = semi.samples(times)
     windows = np.arange(steps)[:, None] * m + np.arange(m + 1)
@@ -35,34 +70,32 @@ def differentiable(run: Run, steps: int, parts: np.ndarray) -> Evolution:
     blended = [v.reshape(v.shape[0], steps * s) for v in semi.blended(sampling, cut)]
     force, jump = semi.forces(*[jnp.concatenate([v[:, :1], b], axis=1) for v, b in zip(samples, blended)])
     numbers = np.append(0, (windows[:, sampling.stages]).reshape(-1))
-    pushing = None if semi.linear else Pushing(semi)
-    still = np.asarray(semi.system.undriven())
-    y = _started(run, samples, force[0], jump[0], h, still)
-    push = None if pushing is None else pushing.given()
+    push = None if semi.linear else Push(semi.source.values, semi.rest, semi.params, semi.reference)
+    if y is None:
+        y = _started(run, samples, force[0], jump[0], h, semi.system.undriven())
     values = tuple(jnp.asarray(v) for v in semi.system.values)
-    found = states(
-        Plan(semi.system, scheme, pushing, still, steps),
-        Inputs(values, push, y, h, force, jump, samples[0].T[numbers], times[numbers]),
-    )
+    return samples, Inputs(values, push, y, h, force, jump, samples[0].T[numbers], times[numbers])
+
+
+def _saved(semi: Semidiscrete, parts: np.ndarray, steps: int, m: int, found: Any, samples: list[Any]) -> list[Any]:
+    """Values (S, N, F) at the saved times, and rates of a problem of second order (or None)."""
     index, weights = dense_output.weights(np.linspace(0.0, 1.0, steps + 1), parts)
-    held = np.round(index * m).astype(int)  # samples at the ends of steps
-    size = semi.system.n
+    at = np.round(index * m).astype(int)  # samples at the ends of steps
+    size, out = semi.system.n, []
+    places = semi.free, semi.held, semi.disc.partner
+    for part, held in ((slice(None, size), 0), (slice(size, None), 3))[: 1 + semi.second]:
+        out.append(_interpolated(found[:, part], samples[held], weights, index, at, *places, fields=semi.fields))
+    return out if semi.second else [*out, None]
 
-    def saved(values: Any) -> Any:
-        return jnp.einsum("sk,sk...->s...", weights, values[index])
 
-    def whole(part: Any, held_values: Any) -> Any:
-        return jnp.stack([semi.placed(jnp.asarray(p), jnp.asarray(q)) for p, q in zip(saved(part), held_values)])
-
-    def of_held(rows: Any) -> Any:
-        return jnp.einsum("sk,sk...->s...", weights, jnp.asarray(rows).T[held])
-
-    u = whole(found[:, :size], of_held(samples[0]))
-    rates = whole(found[:, size:], of_held(samples[3])) if semi.second else None
-    recipe = Recipe("S", run.order, None, "loo", run.fields, min(2, HIGHEST - run.order))
-    finite = jnp.isfinite(u).all()
-    good = finite if is_traced(finite) else bool(finite)
-    return Evolution(t0 + (t1 - t0) * parts, u, rates, run.cloud, recipe, good, {"scheme": scheme.name, "steps": steps})
+@partial(in_one_program, static=("fields",))
+def _interpolated(found: Any, held_values: Any, weights: Any, index: Any, at: Any, free: Any, held: Any, partner: Any,
+                  fields: int) -> Any:  # fmt: skip
+    """All values from the free ones (K + 1, n) and the held ones (held, samples) of the steps around saved times."""
+    mine = jnp.einsum("sk,skn->sn", weights, jnp.asarray(found)[index])
+    given = jnp.einsum("sk,skn->sn", weights, jnp.asarray(held_values).T[at])
+    flat = jnp.zeros((len(index), len(partner) * fields)).at[:, free].set(mine).at[:, held].set(given)
+    return flat.reshape(len(index), -1, fields)[:, partner]
 
 
 def _started(run: Run, samples: list[Any], force: Any, jump: Any, h: Any, still: np.ndarray) -> Any:

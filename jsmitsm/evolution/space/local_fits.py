@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.cloud.neighbours import nearest
-from jsmitsm.evolution.space.matrices import Sparse
+from jsmitsm.discretization.pencil.sparse import Sparse
+from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.taylor.multi_indices import MultiIndex, count, factorial, index_of, multi_indices
 
 # Particles fitted at a time.
@@ -60,7 +62,8 @@ class LocalFits:
 
     def coefficients(self, values: Any) -> Any:
         """Taylor coefficients (N, F, K) of fields (N, F)."""
-        return np.einsum("nkw,nwf->nfk", self.weights, np.asarray(values)[self.near])
+        xp = jnp if is_traced(values) else np
+        return xp.einsum("nkw,nwf->nfk", self.weights, xp.asarray(values)[self.near])
 
 
 class StateFit:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from functools import cached_property
 from typing import Any
 
@@ -12,13 +13,13 @@ import numpy as np
 from jsmitsm.discretization.coefficients import conditions_of
 from jsmitsm.discretization.pencil.assemble import Pencil
 from jsmitsm.discretization.pencil.local import source_stencils
+from jsmitsm.discretization.pencil.sparse import Sparse
 from jsmitsm.evolution.space.local_fits import LocalFits
-from jsmitsm.evolution.space.matrices import Sparse
 from jsmitsm.evolution.space.system import System
 from jsmitsm.evolution.space.timed import Timed
 from jsmitsm.evolution.steps.tableaux import Sampling
 from jsmitsm.runtime.collector import uncollected
-from jsmitsm.runtime.tracers import is_traced
+from jsmitsm.runtime.tracers import any_number, concrete, is_traced
 from jsmitsm.taylor.multi_indices import count
 
 # Steps from which on those to come are looked at together, and the numbers that this may take at a time.
@@ -39,8 +40,7 @@ class Semidiscrete:
         self.disc = disc = pencil.layout.disc
         self.n, self.fields = len(disc.cloud), timed.problem.fields
         self.free, self.held = pencil.free, pencil.held
-        whole = lambda m: Sparse(m.values, m.rows, m.cols, m.shape)  # noqa: E731
-        stiff, source, given = (whole(m) for m in (pencil.A, pencil.B, pencil.Bg))
+        stiff, source, given = pencil.A, pencil.B, pencil.Bg
         masses = [self._times_mass(source, j) for j in ((1, 2) if self.second else (1,))]
         if damping and self.second:
             masses[0] = _sum(masses[0], self._damping(masses[1], damping))
@@ -55,6 +55,15 @@ class Semidiscrete:
         self.source = source.part(self.free, every)
         self.given = given.part(self.free, np.arange(given.shape[1]))
         self._still: Any = None
+
+    def stated(self, values: tuple[Any, ...], push: Any) -> Semidiscrete:
+        """The same with other numbers in its matrices and its nonlinear part; push: None where there is none."""
+        new = copy(self)
+        new.system = self.system.with_values(values)
+        if push is not None:
+            new.source, new.rest = self.source.with_values(push.source), push.record
+            new.params, new.reference = push.params, push.reference
+        return new
 
     @property
     def second(self) -> bool:
@@ -71,12 +80,11 @@ class Semidiscrete:
         """Whether N at u = 0 is a source, taken apart from N: implicitly, and so with more of the scheme's order."""
         if self.linear:
             return True
-        if is_traced(self.points, self.params):
-            return False
+        points, params = jax.tree.map(any_number, (self.points, self.params))
         with np.errstate(all="ignore"):
             slots = np.zeros((len(self.rest.slots), self.n))
-            found = self.rest.residuals(self.points, params=(np.asarray(0.0), self.params), slots=slots)
-        return bool(np.isfinite(found).all())
+            found = concrete(self.rest.residuals(points, params=(np.asarray(0.0), params), slots=slots))
+        return found is None or bool(np.isfinite(found).all())
 
     @property
     def points(self) -> Any:
@@ -223,12 +231,12 @@ class Semidiscrete:
     def nonlinear(self, slots: Any, t: Any, params: Any) -> Any:
         """N (N F,) from its slots' derivatives (S, N)."""
         found = self.rest.residuals(self.points, params=(t, params), slots=slots)
-        xp = jnp if is_traced(found, slots) else np
+        xp = jnp if is_traced(found, slots, self.reference) else np
         if self.apart:
             found = found - self.rest.residuals(self.points, params=(t, params), slots=np.zeros(slots.shape))
         found = xp.broadcast_to(found, (self.fields, self.n))
         if self.reference is not None:
-            found = found - xp.einsum("esn,sn->en", self.reference, slots)
+            found = found - (xp.asarray(self.reference) * slots).sum(axis=1)
         return found.T.reshape(-1)
 
     def steepness(self, u: Any, t: Any) -> np.ndarray:

@@ -7,7 +7,8 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from jsmitsm.evolution.space.matrices import ComplexFactor, RealFactor, Sparse, combined
+from jsmitsm.discretization.pencil.sparse import Sparse, combined
+from jsmitsm.evolution.space.factors import ComplexFactor, RealFactor
 from jsmitsm.linear import linsolve
 from jsmitsm.runtime.tracers import is_traced
 

@@ -104,14 +104,15 @@ def timed(problem: Problem, cloud: Cloud) -> Timed:
     _check_constraints(whole, problem.fields)
     space = [s for s in whole.slots if s[0] < RATE]
     linear = [s for s in space if s not in changing]
-    operator = restricted(whole, linear, affine=True)
-    rest = restricted(whole, [s for s in space if s in changing])
+    operator, rest, still, *masses = restricted(
+        whole, (linear, True), ([s for s in space if s in changing], False), (space, False), *((r, True) for r in rates)
+    )
     orders = [max((sum(b) for (_, b), p in zip(whole.slots, row) if p), default=-1) for row in whole.pattern]
     problem_in_time = closed(stated, whole)
     problem_in_time.pde = operator  # type: ignore[assignment]
     condition_moves = _check_conditions(problem_in_time)
     return Timed(
-        problem_in_time, restricted(whole, space), rest, tuple(restricted(whole, r, affine=True) for r in rates),
+        problem_in_time, still, rest, tuple(masses),
         not source_moves and not condition_moves,
         any(m > max(o, 0) for m, o in zip(orders, operator.order)),
     )  # fmt: skip

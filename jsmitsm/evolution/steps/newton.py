@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from jsmitsm.evolution.space.matrices import Sparse, combined
+from jsmitsm.discretization.pencil.sparse import Sparse, combined
 from jsmitsm.evolution.space.semidiscrete import Semidiscrete
 from jsmitsm.evolution.steps.stepping import Stopped
 from jsmitsm.linear.sparse import Factor
@@ -52,6 +52,30 @@ class Newton:
             f"a stage's equations at t = {t:.6g} were not solved by {MOST} steps of Newton's method: take more steps, "
             "or a tol instead of steps"
         )
+
+    def transposed(
+        self, b: np.ndarray, y: np.ndarray, t: float, g: float, known: np.ndarray, pull: Any, number: int
+    ) -> np.ndarray:
+        """Solves with the transposed matrix of the stage that has the solution y, by an older one where it serves.
+
+        pull: has the transpose of -B N' at this stage.
+        """
+        system, x, r, before = self.semi.system, np.zeros_like(b), b, np.inf
+        fresh = self._factor is None or g != self._g
+        if fresh:
+            self._prepare(y, t, g, known)
+        for _ in range(2 * MOST):
+            change = self._factor.solve(r, True)
+            x = x + change
+            size = float(np.abs(change).max(initial=0.0)) / max(float(np.abs(x).max(initial=0.0)), 1e-300)
+            if size <= 1e-2 * SOLVED or (size <= SOLVED and size >= 0.5 * before):
+                return x
+            if size > SLOW * before and not fresh:
+                self._prepare(y, t, g, known)
+                fresh = True
+            before = size
+            r = b - system.mass_transposed(x) - g * (system.stiff_transposed(x) - pull.state(x, y, number))
+        raise Stopped(f"the transposed equations of a stage at t = {t:.6g} were not solved; take more steps")
 
     def _prepare(self, y: np.ndarray, t: float, g: float, known: np.ndarray) -> None:
         semi = self.semi

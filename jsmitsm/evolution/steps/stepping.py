@@ -65,6 +65,10 @@ class Stepper:
     def order(self) -> int:
         return self.scheme.order
 
+    def smallest(self, h: float) -> float:
+        """The step of backward Euler that its factor serves."""
+        return h * self.scheme.gamma
+
     def first(self, y: np.ndarray, t: float) -> Step:
         """The start: forces and slopes there."""
         return self._ended(y, t, *self.drive.start(t))
@@ -116,6 +120,10 @@ class RadauStepper:
     def __init__(self, system: System, drive: Drive):
         self.system, self.drive = system, drive
         self.still = system.undriven()
+
+    def smallest(self, h: float) -> float:
+        """The step of backward Euler that its real factor serves."""
+        return h / float(RADAU.values[0].real)
 
     def first(self, y: np.ndarray, t: float) -> Step:
         force, held, known = self.drive.start(t)

@@ -11,7 +11,7 @@ from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.equation.problem import Problem
 from jsmitsm.particle.kernels import Kernel
 from jsmitsm.runtime.arrays import Array, ValueOrFunction
-from jsmitsm.runtime.errors import SolveError
+from jsmitsm.runtime.errors import SolveError, is_whole
 from jsmitsm.runtime.progress import bar
 from jsmitsm.solution.arguments import SolveOptions
 from jsmitsm.solution.nonlinear.branch import Branch, follow
@@ -117,7 +117,7 @@ def continuation(
             raise ValueError(
                 f"parameters: the first two say in which direction to follow the branch, and both are {values[0]:.6g}"
             )
-        if isinstance(steps, bool) or not isinstance(steps, int | np.integer) or steps < 1:
+        if not is_whole(steps, 1):
             raise ValueError(f"steps: expected a whole number from 1, the most steps along the branch, got {steps!r}")
         with bar("continuation", len(values)) as shown:
             return follow(problem, cloud, values, u0, int(steps), dict(options), shown)

@@ -1,4 +1,4 @@
-"""Sparse matrices by their entries, whose values JAX may trace, and their resolvents."""
+"""Sparse matrices by their entries, whose values JAX may trace."""
 
 from __future__ import annotations
 
@@ -10,23 +10,27 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jsmitsm.linear import linsolve
 from jsmitsm.runtime.collector import uncollected
 from jsmitsm.runtime.tracers import is_traced
+from jsmitsm.runtime.whole_program import picked
 
 # Entries that are taken together, few enough to stay in cache.
-CHUNK = 1024
+CHUNK = 256
 
 
+@partial(jax.tree_util.register_dataclass, data_fields=["values", "rows", "cols"], meta_fields=["shape"])
+@dataclass(eq=False)
 class Sparse:
-    """A matrix by its entries; those at one place add up. values (nnz,) may be traced, rows and cols not."""
+    """A matrix by its entries (nnz,) and their places; entries at one place add up. The values may be traced."""
 
-    def __init__(self, values: Any, rows: np.ndarray, cols: np.ndarray, shape: tuple[int, int]):
-        self.values, self.rows, self.cols, self.shape = values, rows, cols, shape
+    values: Any
+    rows: np.ndarray
+    cols: np.ndarray
+    shape: tuple[int, int]
 
     @cached_property
     def host(self) -> Any:
-        """The matrix for scipy."""
+        """The matrix for scipy, by rows."""
         with uncollected():
             from scipy import sparse
 
@@ -34,6 +38,7 @@ class Sparse:
 
     @cached_property
     def host_transposed(self) -> Any:
+        """Its transpose for scipy, by rows."""
         return self.host.T.tocsr()
 
     def times(self, x: Any) -> Any:
@@ -45,6 +50,7 @@ class Sparse:
         return _times(self.values, self.rows, self.cols, jnp.asarray(x), self.shape[0])
 
     def with_values(self, values: Any) -> Sparse:
+        """Others at the same places."""
         return Sparse(values, self.rows, self.cols, self.shape)
 
     def part(self, rows: np.ndarray, cols: np.ndarray) -> Sparse:
@@ -53,7 +59,8 @@ class Sparse:
         place[0][rows], place[1][cols] = np.arange(len(rows)), np.arange(len(cols))
         keep = np.flatnonzero((place[0][self.rows] >= 0) & (place[1][self.cols] >= 0))
         at = place[0][self.rows[keep]], place[1][self.cols[keep]]
-        return Sparse(self.values[keep], *at, (len(rows), len(cols)))
+        values = picked(self.values, keep) if is_traced(self.values) else self.values[keep]
+        return Sparse(values, *at, (len(rows), len(cols)))
 
 
 def _times(values: Any, rows: Any, cols: Any, x: Any, n: int) -> Any:
@@ -111,34 +118,3 @@ def combined(parts: list[tuple[Any, Sparse]]) -> tuple[Any, np.ndarray, np.ndarr
     xp = jnp if is_traced([(f, m.values) for f, m in parts]) else np
     values = xp.concatenate([f * xp.asarray(m.values) for f, m in parts])
     return values, np.concatenate([m.rows for _, m in parts]), np.concatenate([m.cols for _, m in parts])
-
-
-class ComplexFactor:
-    """The factors of P + i Q as those of the real matrix [P, -Q; Q, P]; the transpose is not conjugated."""
-
-    def __init__(self, entries: tuple[Any, Any, Any], n: int, points: np.ndarray | None):
-        values, rows, cols = entries
-        real, imag = values.real, values.imag
-        self._factor = linsolve.factor(
-            np.concatenate([real, real, -imag, imag]), np.concatenate([rows, rows + n, rows, rows + n]),
-            np.concatenate([cols, cols + n, cols + n, cols]), 2 * n,
-            None if points is None else np.concatenate([points, points]), "sparse", False, 0,
-        )  # fmt: skip
-        self.n = n
-
-    def solve(self, b: np.ndarray, transpose: bool = False) -> np.ndarray:
-        # The real transpose is that of the conjugate.
-        b = b.conj() if transpose else b
-        x = self._factor.solve(np.concatenate([b.real, b.imag]), transpose)
-        x = x[: self.n] + 1j * x[self.n :]
-        return x.conj() if transpose else x
-
-
-class RealFactor:
-    """A factorisation that is kept among those of the package, solved with as it is."""
-
-    def __init__(self, entries: tuple[Any, Any, Any], n: int, points: np.ndarray | None):
-        self._factor = linsolve.factor(*entries, n, points, "sparse", False, 0)
-
-    def solve(self, b: np.ndarray, transpose: bool = False) -> np.ndarray:
-        return self._factor.solve(b, transpose)

@@ -1,0 +1,114 @@
+"""The way back through a step of an additive scheme, and such steps inside of a program.
+
+With S = E + g h A, P_j = F_j - A Y_j and Q_j = -B N(Y_j, t_j) (see stepping for the stages) the cotangents run
+backwards through the stages i = s .. 1, Y_s being the next state:
+
+    Y_i* += -A^T P_i* + Q'(Y_i)^T Q_i*,   F_i* += P_i*,   l = S^-T Y_i*
+    y* += E^T l,   H* += l,   H_i* -= l,   F_i* += g h l,   P_j* += h a_ij l,   Q_j* += h e_ij l  (j < i)
+    h* += l . (sum_{j<i} a_ij P_j + e_ij Q_j + g (F_i - A Y_i))
+    E* += l (y - Y_i)^T,   A* -= (g h l + P_i*) Y_i^T
+
+and at the start of the step y* += -A^T P_0* + Q'(y)^T Q_0*, F_0* += P_0*, A* -= P_0* y^T. Where stages are solved by
+Newton's method Q_i counts to P_i: then S = E + g h (A + B N'(Y_i)), and N takes the cotangent g h l + P_i* of Q_i.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jsmitsm.evolution.gradient.bars import Bars
+from jsmitsm.evolution.gradient.inputs import Inputs
+from jsmitsm.evolution.space.semidiscrete import Semidiscrete
+from jsmitsm.evolution.steps.newton import Newton
+from jsmitsm.evolution.steps.tableaux import Additive
+
+
+def back(
+    scheme: Additive, bars: Bars, newton: Newton | None, k: int, y: np.ndarray, stages: list[np.ndarray],
+    y_bar: np.ndarray,
+) -> np.ndarray:  # fmt: skip
+    """From the cotangent of a step's end to that of its start."""
+    at, system, pull, ys = bars.at, bars.system, bars.pull, [y, *stages]
+    h, g, s = float(at.h), scheme.gamma, scheme.stages - 1
+    first = k * s
+    rates = _rates(scheme, bars, newton is not None, ys, first) if bars.timed else None
+    p_bar, q_bar = (np.zeros((s + 1, system.size)) for _ in range(2))
+    start_bar, stage_bar = np.zeros(system.size), y_bar
+    for i in range(s, 0, -1):
+        number = first + i
+        slope = p_bar[i]
+        if newton is None or pull is None:
+            low = system.resolvent(h * g).solve_transposed(stage_bar)
+        else:
+            low = newton.transposed(stage_bar, ys[i], at.times[number], h * g, at.known[number], pull, number)
+            pull.collect((g * h) * low + slope, ys[i], number)
+        start_bar += system.mass_transposed(low)
+        bars.jump[first] += low
+        bars.jump[number] -= low
+        bars.force[number] += (g * h) * low
+        for j in range(i):
+            if scheme.implicit[i, j]:
+                p_bar[j] += (h * scheme.implicit[i, j]) * low
+            if pull is not None and newton is None and scheme.explicit[i, j]:
+                q_bar[j] += (h * scheme.explicit[i, j]) * low
+        if rates is not None:
+            bars.h += float(low @ rates[i])
+        bars.mass(low, y - ys[i])
+        bars.stiff((-g * h) * low - slope, ys[i])
+        # On to stage i - 1: what asked for its slope.
+        p_bar[i - 1][bars.still] = 0.0
+        number, slope = number - 1, p_bar[i - 1]
+        bars.force[number] += slope
+        stage_bar = -system.stiff_transposed(slope)
+        if pull is not None:
+            asked = slope if newton is not None else q_bar[i - 1]
+            stage_bar = stage_bar + pull.state(asked, ys[i - 1], number)
+            if newton is None or i == 1:
+                pull.collect(asked, ys[i - 1], number)
+    bars.stiff(-p_bar[0], y)
+    return start_bar + stage_bar
+
+
+def _rates(scheme: Additive, bars: Bars, newton: bool, ys: list[np.ndarray], first: int) -> list[Any]:
+    """For every stage what its right-hand side and matrix take of h."""
+    at, s = bars.at, scheme.stages - 1
+    p = [at.force[first + j] - bars.system.stiff(y) for j, y in enumerate(ys)]
+    q = [np.zeros_like(v) for v in p]
+    if bars.pull is not None:
+        q = [bars.semi.explicit(y, at.times[first + j], at.known[first + j]) for j, y in enumerate(ys)]
+        if newton:
+            p, q = [a + b for a, b in zip(p, q)], [np.zeros_like(v) for v in q]
+    slopes = [np.where(bars.still, 0.0, v) for v in p]
+    out: list[Any] = [None]
+    for i in range(1, s + 1):
+        before = sum(scheme.implicit[i, j] * slopes[j] + scheme.explicit[i, j] * q[j] for j in range(i))
+        out.append(before + scheme.gamma * p[i])
+    return out
+
+
+def scanned(scheme: Additive, semi: Semidiscrete, steps: int, given: Inputs) -> Any:
+    """The same as ``Stepper`` inside of a program: a scan over the steps, every solve JAX's to differentiate."""
+    now = semi.stated(given.values, given.push)
+    system, still, s, g = now.system, semi.system.undriven(), scheme.stages - 1, scheme.gamma
+    resolvent = system.resolvent(given.h * g)
+
+    def step(y: Any, window: Any) -> tuple[Any, Any]:
+        whole = given.force, given.jump, given.known, given.times
+        force, jump, known, times = (jnp.asarray(v)[window] for v in whole)
+        base, ps, qs, last = system.mass(y) + jump[0], [], [], y
+        for i in range(1, s + 1):
+            ps.append(jnp.where(still, 0.0, force[i - 1] - system.stiff(last)))
+            qs.append(now.explicit(last, times[i - 1], known[i - 1]))
+            r = base - jump[i] + (given.h * g) * force[i]
+            r = r + sum(given.h * scheme.implicit[i, j] * ps[j] for j in range(i) if scheme.implicit[i, j])
+            r = r + sum(given.h * scheme.explicit[i, j] * qs[j] for j in range(i) if scheme.explicit[i, j])
+            last = resolvent.solve(r)
+        return last, last
+
+    y = jnp.asarray(given.y, float)
+    windows = np.arange(steps)[:, None] * s + np.arange(s + 1)
+    return jnp.concatenate([y[None], jax.lax.scan(step, y, windows)[1]])
