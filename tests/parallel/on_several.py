@@ -18,6 +18,8 @@ import jsmitsm.parallel as jp  # noqa: E402
 from jsmitsm.discretization.leave_one_out import matrix  # noqa: E402
 
 COMM = MPI.COMM_WORLD
+# Of low order, whose programs compile quickly: what several processes share does not hang on it.
+CHEAP = {"order": 2, "depth": 0}
 SIDES = ("left", "right", "bottom", "top")
 
 
@@ -86,9 +88,9 @@ def refused(call):
 def main():
     found = {}
     problem, cloud = mixed()
-    one = js.solve(problem, cloud)
+    one = js.solve(problem, cloud, **CHEAP)
     for solver in ("hypre", "gamg", "mumps"):
-        sol = jp.solve(problem, cloud, solver=solver)
+        sol = jp.solve(problem, cloud, solver=solver, **CHEAP)
         found[f"values {solver}"] = off(sol, one)
         found[f"iterations {solver}"] = sol.stats["linear"]["iterations"]
     found["rows"] = jp.norm(of_rows(sol, one))
@@ -110,40 +112,40 @@ def main():
     COMM.Barrier()
     names = {name: k for k, name in enumerate(cloud.groups)}
     slabs = jp.read(f"{folder}/x.npy", f"{folder}/g.npy", f"{folder}/n.npy", names=names)
-    found["read"] = off(jp.solve(problem, slabs), one)
+    found["read"] = off(jp.solve(problem, slabs, **CHEAP), one)
     jp.save(sol, f"{folder}/u.pvtu", error=error)
     found["folder"] = folder
 
     problem, cloud = graded()
-    one, sol = js.solve(problem, cloud), jp.solve(problem, cloud)
+    one, sol = js.solve(problem, cloud, **CHEAP), jp.solve(problem, cloud, **CHEAP)
     found["graded"], found["graded rows"] = off(sol, one), jp.norm(of_rows(sol, one))
     found["repaired"] = [sol.stats["repaired"].tolist(), np.sort(one.stats["repaired"]).tolist()]
     kernel = js.SuperGaussian(h=0.8 * np.asarray(js.stencils(cloud, size=14).radius), d=1.5)
-    options = {"kernel": kernel, "order": 2}
+    options = {"kernel": kernel, **CHEAP}
     found["kernel"] = off(jp.solve(problem, cloud, **options), js.solve(problem, cloud, **options))
-    options = {"method": "III", "order": 2}
+    options = {"method": "III", **CHEAP}
     problem, cloud = mixed()
     found["III"] = off(jp.solve(problem, cloud, **options), js.solve(problem, cloud, **options))
 
     problem, cloud = system()
-    sol = jp.solve(problem, cloud, order=2)
-    found["system"], found["gathered"] = off(sol, js.solve(problem, cloud, order=2)), np.shape(sol.gathered())
+    sol = jp.solve(problem, cloud, **CHEAP)
+    found["system"], found["gathered"] = off(sol, js.solve(problem, cloud, **CHEAP)), np.shape(sol.gathered())
 
     cube = js.box((0, 0, 0), (1, 1, 1), (8, 8, 8), jitter=0.2)
     sides = {name: js.dirichlet(0.0) for name in cube.groups if name != "interior"}
     problem = js.Problem(lambda u, x: js.laplacian(u)(x) + x[2], sides)
-    found["cube"] = off(jp.solve(problem, cube, order=2), js.solve(problem, cube, order=2))
+    found["cube"] = off(jp.solve(problem, cube, **CHEAP), js.solve(problem, cube, **CHEAP))
 
     cloud = js.rectangle((0, 0), (1, 1), (12, 12))
     held = {name: js.dirichlet(lambda x, k: k["rim"] * x[0]) for name in SIDES}
     pde = lambda u, x, k: k["d"] * js.laplacian(u)(x) - x[0] * u(x) + 1.0  # noqa: E731
     problem = js.Problem(pde, held, params={"d": jnp.array(0.7), "rim": jnp.array(0.4)})
-    value, slope = jp.value_and_grad(lambda u, x, k: (u**2).sum(), problem, cloud, order=2, depth=0)
-    alone = lambda p: (js.solve(problem.replace(params=p), cloud, order=2, depth=0).u ** 2).sum()  # noqa: E731
+    value, slope = jp.value_and_grad(lambda u, x, k: (u**2).sum(), problem, cloud, **CHEAP)
+    alone = lambda p: (js.solve(problem.replace(params=p), cloud, **CHEAP).u ** 2).sum()  # noqa: E731
     value_one, slope_one = jax.value_and_grad(alone)(problem.params)
     found["value"] = abs(value - float(value_one))
     found["gradient"] = max(abs(float(slope[k] - slope_one[k])) for k in slope)
-    _, moved = jp.value_and_grad(lambda u, x, k: (u**2).sum(), problem, cloud, wrt="points", order=2, depth=0)
+    _, moved = jp.value_and_grad(lambda u, x, k: (u**2).sum(), problem, cloud, wrt="points", **CHEAP)
     found["by points"] = _differences(problem, cloud, moved)
 
     none = {name: js.neumann(0.0) for name in SIDES}
@@ -168,7 +170,7 @@ def _differences(problem, cloud, moved):
     """By how much the gradient by two particles' places misses central differences of one process."""
     whole = np.zeros(np.shape(cloud.points))
     parts = COMM.allgather(moved)
-    own = COMM.allgather(jp.solve(problem, cloud, order=2, depth=0).numbers)
+    own = COMM.allgather(jp.solve(problem, cloud, **CHEAP).numbers)
     for ids, part in zip(own, parts):
         whole[ids] = part
     worst = 0.0
@@ -179,7 +181,7 @@ def _differences(problem, cloud, moved):
         for sign in (1.0, -1.0):
             there = points.copy()
             there[at, axis] += sign * step
-            one = js.solve(problem, cloud.replace(points=there), order=2, depth=0, stencils=near)
+            one = js.solve(problem, cloud.replace(points=there), **CHEAP, stencils=near)
             sides.append(float((np.asarray(one.u) ** 2).sum()))
         worst = max(worst, abs((sides[0] - sides[1]) / (2.0 * step) - whole[at, axis]))
     return worst
