@@ -82,16 +82,30 @@ def repaired(
         elif not weak.all():
             new_classes.append(_some(cls, ~weak))
             new_rows.append(_take(row, ~weak))
-    for found in pieces.values():
+    sizes = _sizes(disc, pieces)
+    for key, found in pieces.items():
         poor = [(_some(cls, at), _take(row, at)) for cls, row, at in found if len(at)]
         if poor:
-            size = max(int((cls.neighbours >= 0).sum(axis=1).max()) for cls, *_ in found)
-            for cls, row, changed in _parted(disc, nums, *_repaired(disc, nums, poor, size), size):
+            for cls, row, changed in _parted(disc, nums, *_repaired(disc, nums, poor, sizes[key]), sizes[key]):
                 new_classes.append(cls)
                 new_rows.append(row)
                 touched.append(changed)
     after = examine(new_classes, new_rows)
     return new_classes, new_rows, replace(after, repaired=np.concatenate(touched))
+
+
+def _sizes(disc: Discretization, pieces: dict[Any, list[tuple[Class, Row, np.ndarray]]]) -> dict[Any, int]:
+    """The largest stencil of every kind of class that has weak ones; in a part of a cloud those of the whole."""
+    mine = {
+        key: max(int((cls.neighbours >= 0).sum(axis=1).max()) for cls, *_ in found)
+        for key, found in pieces.items()
+        if disc.part is not None or any(len(at) for *_, at in found)
+    }
+    if disc.part is None:
+        return mine
+    names = {key: (key[0].n_own, key[0].lost, key[1]) for key in mine}
+    largest = disc.part.largest({names[key]: size for key, size in mine.items()})
+    return {key: largest[name] for key, name in names.items()}
 
 
 def _parted(
