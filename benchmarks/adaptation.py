@@ -1,8 +1,10 @@
 """Tolerances in, answers out: ``python -m benchmarks.adaptation [name ...] [--tol 1e-3 1e-6] [--most 300000]``.
 
-Every problem of :mod:`benchmarks.nist` from the default start, nothing told of its solution. Prints a table as it goes
-and writes ``benchmarks/data/adaptation.json``; a line that begins with WRONG tells of an answer called reached
-whose true error is more than three times the tolerance.
+Every problem of :mod:`benchmarks.nist` from the default start, nothing told of its solution; beside it adaptive finite
+elements (:mod:`benchmarks.elements`) where NGSolve is installed. Prints a table as it goes and writes
+``benchmarks/data/adaptation.json``, problem by problem: rows of earlier runs stay. With ``--only elements`` those
+rows get their elements anew. A line that begins with WRONG tells of an answer called reached whose true error is more
+than three times the tolerance.
 """
 
 from __future__ import annotations
@@ -17,6 +19,7 @@ import jax
 import numpy as np
 
 import jsmitsm as js
+from benchmarks import elements
 from benchmarks.machine import describe
 from benchmarks.nist import CASES, LEFT_OUT, Case
 
@@ -47,19 +50,31 @@ def measure(name: str, tol: float, most: int) -> dict[str, Any]:
         "order": found.solution.order,
         "rounds": len(counts),
         "seconds": seconds,
-        "whole": float(counts.sum() / counts[-1]),
+        "history": {name: column.tolist() for name, column in found.history.items()},
         "said": found.messages + found.flags,
     }
 
 
+def beside(name: str, tol: float, most: int) -> dict[str, Any] | None:
+    """What adaptive finite elements need for the same, None where there are none."""
+    return elements.adaptive(CASES[name](), tol, most) if elements.available() else None
+
+
 def shown(row: dict[str, Any]) -> str:
+    other = row.get("elements")
+    fem = "- | -" if not other else f"{other['unknowns']}{'' if other['reached'] else '*'} | {other['seconds']:.1f}"
     if "failed" in row:
-        return f"| {row['name']} | {row['tol']:.0e} | failed: {row['failed']} | | | | | | |"
+        return f"| {row['name']} | {row['tol']:.0e} | failed: {row['failed']} | | | | | | | {fem} |"
     ratio = row["estimate"] / row["true"] if row["true"] else float("nan")
     return (
         f"| {row['name']} | {row['tol']:.0e} | {'yes' if row['reached'] else 'no'} | {row['true']:.1e} | "
-        f"{ratio:.2f} | {row['particles']} | {row['order']} | {row['rounds']} | {row['seconds']:.1f} |"
+        f"{ratio:.2f} | {row['particles']} | {row['order']} | {row['rounds']} | {row['seconds']:.0f} | {fem} |"
     )
+
+
+def kept(path: Path) -> list[dict[str, Any]]:
+    """Rows of earlier runs, which one of a single problem does not lose."""
+    return json.loads(path.read_text())["rows"] if path.exists() else []
 
 
 def check(rows: list[dict[str, Any]]) -> list[str]:
@@ -78,17 +93,28 @@ def main() -> None:
     parser.add_argument("--tol", nargs="+", type=float, default=[1e-3, 1e-6])
     parser.add_argument("--most", type=int, default=300_000)
     parser.add_argument("--out", type=Path, default=DATA)
+    parser.add_argument("--only", choices=["elements", "particles"])
     given = parser.parse_args()
     print(f"Left out, for they need several materials: {', '.join(LEFT_OUT)}.")
-    print("| problem | tolerance | reached | true error | estimate / true | particles | order | rounds | seconds |")
-    print("| --- | --- | --- | --- | --- | --- | --- | --- | --- |", flush=True)
-    rows = []
+    if not elements.available():
+        print("No finite elements: NGSolve is not installed (pip install ngsolve).")
+    print(
+        "| problem | tolerance | reached | true error | estimate / true | particles | order | rounds | seconds | "
+        "unknowns of finite elements | seconds |"
+    )
+    print("| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |", flush=True)
     for name in given.names or CASES:
         for tol in given.tol:
-            rows.append(measure(name, tol, given.most))
-            print(shown(rows[-1]), flush=True)
+            before = [r for r in kept(given.out) if (r["case"], r["tol"]) == (name, tol)]
+            if given.only == "elements" and not before:
+                continue
+            row = before[0] if given.only == "elements" else measure(name, tol, given.most)
+            if given.only != "particles":
+                row["elements"] = beside(name, tol, given.most)
+            print(shown(row), flush=True)
+            rows = [r for r in kept(given.out) if (r["case"], r["tol"]) != (name, tol)] + [row]
             given.out.write_text(json.dumps({"machine": describe(), "rows": rows}, indent=1) + "\n")
-    for line in check(rows):
+    for line in check(kept(given.out)):
         print(f"WRONG: {line}")
 
 

@@ -23,13 +23,19 @@ HAIR = 0.005
 
 
 class Case(NamedTuple):
-    """A problem with its domain and the exact solution."""
+    """A problem with its domain and the exact solution.
+
+    operator: diffusion, wind and reaction (a function, None without one) of scalar problems other than Poisson's, for
+    who states it in another form; homogeneous: without a source.
+    """
 
     name: str
     problem: js.Problem
     make: Callable[[Any], js.Cloud]
     exact: Callable[[Any], Any]
     polygon: tuple[tuple[float, float], ...] | None = None
+    operator: tuple[float, tuple[float, float], Any] | None = None
+    homogeneous: bool = False
 
 
 def _polygon(name: str, polygon: Any, exact: Any, pde: Any, fields: int = 1) -> Case:
@@ -78,7 +84,8 @@ def reentrant(angle: float, name: str) -> Case:
         r, t = polar(x, cut)
         return jnp.where(r > 0, jnp.where(r > 0, r, 1.0) ** a * jnp.sin(a * t), 0.0)
 
-    return _polygon(f"reentrant corner, {name}", sector(angle), exact, lambda u, x: js.laplacian(u)(x))
+    case = _polygon(f"reentrant corner, {name}", sector(angle), exact, lambda u, x: js.laplacian(u)(x))
+    return case._replace(homogeneous=True)
 
 
 def elastic(mode: int) -> Case:
@@ -128,7 +135,7 @@ def layer(eps: float) -> Case:
         slope = js.grad(u)(x)
         return -eps * js.laplacian(u)(x) + 2 * slope[0] + slope[1] - source
 
-    return _polygon(f"boundary layer, {eps:.0e}", SQUARE, exact, pde)
+    return _polygon(f"boundary layer, {eps:.0e}", SQUARE, exact, pde)._replace(operator=(eps, (2.0, 1.0), None))
 
 
 def line(a: float = 0.6) -> Case:
@@ -154,7 +161,9 @@ def oscillatory(count: int) -> Case:
         r = jnp.sqrt(x[0] ** 2 + x[1] ** 2)
         return -js.laplacian(u)(x) - u(x) / (a + r) ** 4 - known(x)
 
-    return _polygon(f"oscillatory, 1/({count} pi)", UNIT, exact, pde)
+    reaction = lambda x: -1.0 / (a + jnp.sqrt(x[0] ** 2 + x[1] ** 2)) ** 4
+    case = _polygon(f"oscillatory, 1/({count} pi)", UNIT, exact, pde)
+    return case._replace(operator=(1.0, (0.0, 0.0), reaction))
 
 
 def front(a: float, centre: tuple[float, float], radius: float, name: str) -> Case:

@@ -18,6 +18,8 @@ from benchmarks.random_cases.judging import BETWEEN, FLOOR, KINDS, RIGHT, WRONG,
 DATA = Path(__file__).parent.parent / "data" / "random.json"
 # So many cases make the sweep.
 WHOLE = 4000
+# So many cases of a recipe at a time.
+TURN = 8
 CLASSES, METHODS = ("linear", "nonlinear", "system"), ("S", "I", "II", "III", "SSPH")
 
 
@@ -33,15 +35,19 @@ def swept(seed: int, cases: int, jobs: int, scratch: Path) -> list[dict[str, Any
 
 
 def part(seed: int, cases: int, jobs: int, k: int, scratch: Path) -> None:
-    """One process's share: every ``jobs``-th recipe, each record written when it is there."""
+    """One process's share: every ``jobs``-th recipe, each record written when it is there.
+
+    A few members of every recipe, then the next few: a run that is broken off has seen all kinds.
+    """
     done = {r["case"] for r in found(scratch, seed, cases)}
     with (scratch / f"seed{seed}-{k}of{jobs}.jsonl").open("a") as out:
-        for number in range(cases):
-            if (number // MEMBERS) % jobs == k and number not in done:
-                out.write(json.dumps({"seed": seed, **attempt(case(seed, number))}) + "\n")
-                out.flush()
-                if number % MEMBERS == MEMBERS - 1:
-                    tidy()
+        for first in range(0, MEMBERS, TURN):
+            for start in range(k * MEMBERS, cases, jobs * MEMBERS):
+                turn = range(start + first, min(start + first + TURN, start + MEMBERS, cases))
+                for number in [n for n in turn if n not in done]:
+                    out.write(json.dumps({"seed": seed, **attempt(case(seed, number))}) + "\n")
+                    out.flush()
+                tidy()
 
 
 def found(scratch: Path, seed: int, cases: int) -> list[dict[str, Any]]:
@@ -66,7 +72,7 @@ def judgement(records: list[dict[str, Any]], seed: int) -> dict[str, Any]:
     right = sum(r["kind"] in ("accurate", "right, yet flagged") for r in records)
     needless = sum(r["kind"] == "right, yet flagged" for r in records)
     kinds = ", ".join(f"{sum(r['class'] == name for r in records)} {name}" for name in CLASSES)
-    part = f"The first of {WHOLE} cases, the rest has not run: " if len(records) < WHOLE else "Of these cases "
+    part = f"Some of {WHOLE} cases, the rest has not run: " if len(records) < WHOLE else "Of these cases "
     note = (
         f"`python -m benchmarks.stability --random --seed {seed} --cases {len(records)}` on {machine['processor']}, "
         f"JAX {machine['jax']}: drawn from operators of first to fourth order with variable and steep coefficients, "

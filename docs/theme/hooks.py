@@ -1,4 +1,5 @@
-"""What the site needs beyond Markdown: formulas as MathML, names that link to the reference, tables that scroll."""
+"""What the site needs beyond Markdown: formulas as MathML, names that link to the reference, tables that scroll, pages
+of the notebooks and of the gallery's examples."""
 
 import ast
 import html
@@ -41,7 +42,36 @@ def on_files(files, config):
     for path in sorted((ROOT / "notebooks").glob("*.ipynb")):
         content = notebook(json.loads(path.read_text()))
         files.append(File.generated(config, f"notebooks/{path.stem}.md", content=content))
+    for path in sorted((ROOT / "docs" / "gallery").glob("*.py")):
+        files.append(File.generated(config, f"gallery/{path.stem}.md", content=example(path)))
     return files
+
+
+def parted(path):
+    """The title of an example of the gallery, what is said of it, and its code."""
+    text = path.read_text()
+    told, code = text.split('"""', 2)[1:]
+    title, _, words = told.partition("\n\n")
+    return title, words.strip(), code.strip()
+
+
+def example(path):
+    """The page of an example: what it shows, its picture, its code."""
+    title, words, code = parted(path)
+    return "\n\n".join(
+        (f"# {title}", words, f"![{title}]({path.stem}.png)", f"```python\n{code}\n```",
+         f"The number is checked at every change of the package. [The file]({path.name}){{:download}},"
+         " [all examples](../gallery.md).")
+    )  # fmt: skip
+
+
+def cards(match):
+    """Pictures of examples with their titles, each a link to its page."""
+    made = []
+    for name in match[1].split():
+        title = parted(ROOT / "docs" / "gallery" / f"{name}.py")[0]
+        made.append(f"[![]({'gallery/' + name}.png){{ loading=lazy }}<span>{title}</span>](gallery/{name}.md)")
+    return '<div class="gallery" markdown>\n' + "\n".join(made) + "\n</div>"
 
 
 def notebook(content):
@@ -62,7 +92,8 @@ def notebook(content):
 
 
 def on_page_markdown(markdown, page, config, files):
-    """The table of all names, and entries for those that no other page of the reference has."""
+    """The table of all names, and entries for those that no other page of the reference has; cards of the gallery."""
+    markdown = re.sub(r"<!-- gallery: ([\w ]+) -->", cards, markdown)
     if page.file.src_uri == "reference.md":
         rows = "\n".join(f"| `js.{name}` | {summary(name)} |" for name in public_names())
         markdown = markdown.replace("<!-- names -->", f"| name | what it is |\n| --- | --- |\n{rows}")

@@ -39,18 +39,19 @@ class Marks(NamedTuple):
 
 
 def marks(
-    points: np.ndarray, spacing: np.ndarray, contribution: np.ndarray, power: float, before: Marks | None
-) -> Marks:
+    points: np.ndarray, spacing: np.ndarray, contribution: np.ndarray, power: float, before: Marks | None,
+    expected: float | None = None,
+) -> Marks:  # fmt: skip
     """Contributions smoothed, and the rates at which they fall with the spacing.
 
     power: that of a smooth solution. before: those of the round before, None where it had another order or was
-    not trustworthy.
+    not trustworthy; then all fall at the rate ``expected``, that of a smooth solution if None.
     """
     from scipy.spatial import cKDTree
 
     near = cKDTree(points).query(points, k=range(1, min(_WORST, len(points)) + 1))[1]
     largest = contribution[near[:, :_NEAR]].max(axis=1)
-    rate = np.full(len(points), power)
+    rate = np.full(len(points), power if expected is None else expected)
     if before is not None:
         old = cKDTree(before.points).query(points)[1]
         rate = before.rate[old] + power - before.rate.max(initial=power)

@@ -85,11 +85,10 @@ def gaps(sol: Solution) -> np.ndarray | None:
         found = np.asarray(sol.coefficients, float)
     except (ValueError, SolveError):
         return None  # a source that is infinite on the boundary
-    from scipy.spatial import cKDTree
-
     found = found.reshape(*found.shape[:2], -1)
     points, dim = np.asarray(sol.cloud.points), sol.cloud.dim
-    near = cKDTree(points).query(points, k=range(2, min(2 * dim + 1, len(points)) + 1))[1]
+    near = sol.neighbours[:, 1 : 2 * dim + 1]  # those across a slit are none
+    near = np.where((near >= 0) & (near < len(points)), near, np.arange(len(points))[:, None])
     index = multi_indices(dim, sol.order + sol.depth)
     worst = np.zeros(len(points))
     for k in range(near.shape[1]):

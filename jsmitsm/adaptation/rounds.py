@@ -31,6 +31,10 @@ _LADDER = {
 _HOPE = 0.5
 # Polynomials of neighbours may differ between them by so many tolerances.
 _GAP = 10.0
+# Where they part, at a corner most often, that falls with this power of the spacing.
+_PARTED = 0.5
+# While only that is wanting, the error at the particles may go back to so many of the usual aims.
+_EASED = 1.5
 # A cloud of this part of the particles that are allowed is the last.
 _FULL = 0.8
 # So many solves in a row may fail, each followed by one on a finer cloud.
@@ -94,7 +98,9 @@ class Rounds:
             refused = 0
             shown.update(1)
             shown.note(f"{len(cloud)} particles, error {found.error:.1e}")
-            if self._done(sol, found, cloud, spacing):
+            done = self._done(sol, found, cloud, spacing)
+            self._clocked()
+            if done:
                 return
             if number == self.max_rounds - 1:
                 self._limit(f"the {self.max_rounds} rounds that were allowed (max_rounds)")
@@ -123,6 +129,13 @@ class Rounds:
         self.clock = now
         self.solution, self.error, self.number = sol, found.error, found.number
         return sol, found
+
+    def _clocked(self) -> None:
+        """What was spent since the last row belongs to its round: the check by another order."""
+        now = time.perf_counter()
+        *row, seconds, smallest = self.rows[-1]
+        self.rows[-1] = (*row, seconds + now - self.clock, smallest)  # type: ignore[assignment]
+        self.clock = now
 
     def _solve(self, cloud: Cloud, order: int, start: Any = None) -> Solution:
         options = dict(self.options)
@@ -226,19 +239,19 @@ class Rounds:
         power = self.solution.order + 1.0 + min(0, cloud.dim - self._operator_order(self.solution))
         trusted = len(self.rows) > 1 and self.rows[-2][1] == self.rows[-1][1] and np.isfinite(found.error)
         contribution, error = found.contribution, self.error if np.isfinite(self.error) else 1e3
-        between = self.apart is not None
-        if self.apart is not None:
-            contribution, error = self.apart, float(self.apart.max()) / found.scale / _GAP
-            trusted, self.apart = False, None
+        apart, self.apart = self.apart, None
         here = marks(points, h, contribution, power, self.before if trusted else None)
         self.before = here if np.isfinite(found.error) else None
         if len(cloud) >= _FULL * self.max_particles:
             self._limit(f"the {self.max_particles} particles that were allowed (max_particles)")
             return None
         most = min(max(_GROWTH * len(cloud), _SMALL[cloud.dim]), self.max_particles)
-        wanted = self.tol if error > self.tol else 0.5 * error
+        wanted = _EASED * self.tol if apart is not None else self.tol if error > self.tol else 0.5 * error
         made_h, _ = next_spacing(here, power, error, wanted, most)
-        made_h = np.minimum(made_h, h) if between else made_h
+        if apart is not None:
+            parted = marks(points, h, apart, power, None, _PARTED)
+            finer, _ = next_spacing(parted, power, float(apart.max()) / found.scale / _GAP, self.tol, most)
+            made_h = np.where(finer < h, np.minimum(made_h, finer), made_h)
         field = SpacingField(points, made_h, spacing.largest)
         for _ in range(8):
             try:
@@ -251,7 +264,7 @@ class Rounds:
                 continue
             if len(following) > self.max_particles:
                 field = field.scaled((1.1 * len(following) / self.max_particles) ** (1.0 / cloud.dim))
-            elif len(following) < _LEAST * len(cloud) and len(cloud) > _LARGE:
+            elif apart is None and len(following) < _LEAST * len(cloud) and len(cloud) > _LARGE:
                 field = field.scaled((len(following) / (1.1 * _LEAST * len(cloud))) ** (1.0 / cloud.dim))
             else:
                 break

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Hashable, Iterator, Mapping
 from typing import Any
 
 import jax
 import numpy as np
 
+from jsmitsm.runtime import notebooks
 from jsmitsm.runtime.arrays import Array, ArrayLike
 from jsmitsm.runtime.errors import refuse_masked, some
-from jsmitsm.runtime.tracers import frozen, owned
+from jsmitsm.runtime.tracers import frozen, is_traced, owned
 
 INTERIOR = "interior"
 # Coordinates beyond this, or all below its inverse, have powers that are no numbers.
 FAR = 1e100
+# What follows from the particles is kept with a cloud of up to so many, for so many different questions.
+_LARGEST_KEPT, _MOST_KEPT = 100_000, 8
 
 
 class Groups(Mapping[str, np.ndarray]):
@@ -86,6 +89,7 @@ class Cloud:
     """
 
     cell_groups = Groups({})  # also of clouds pickled before there were any
+    _shape: Any = None  # what the particles fill, where their maker knows it: pictures end there
 
     def __init__(
         self,
@@ -107,7 +111,23 @@ class Cloud:
         object.__setattr__(self, name, value)
 
     def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in self.__dict__.items() if name != "_inside"}  # made again when needed
+        made_again = ("_inside", "_kept", "_shape")  # when needed, or looked at by pictures alone
+        return {name: value for name, value in self.__dict__.items() if name not in made_again}
+
+    def kept(self, question: Hashable, answer: Callable[[], Any]) -> Any:
+        """What ``answer()`` gives, or gave when it was last asked: it may rest on the question and on this cloud alone.
+
+        The next solve on a cloud finds neighbours, supports and classes as they were. It must not change what it gets.
+        """
+        if len(self) > _LARGEST_KEPT or is_traced(self.points, self.normals):
+            return answer()
+        kept = self.__dict__.setdefault("_kept", {})
+        found = kept.pop(question, None)
+        found = answer() if found is None else found
+        kept[question] = found  # the last one used stands last
+        while len(kept) > _MOST_KEPT:
+            kept.pop(next(iter(kept)), None)
+        return found
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update({name: frozen(value) for name, value in state.items()})
@@ -183,6 +203,17 @@ class Cloud:
     def __repr__(self) -> str:
         cells = f", cell groups {self.cell_groups!r}" if self.cell_groups else ""
         return f"Cloud({len(self)} particles in {self.dim}D, groups {self.groups!r}{cells})"
+
+    def _repr_html_(self) -> str:
+        if is_traced(self.points):
+            return repr(self)
+        points, kind = np.asarray(self.points), np.zeros(len(self))
+        for k, index in enumerate(index for name, index in self.groups.items() if name != INTERIOR):
+            kind[index] = k + 1
+        box = " x ".join(notebooks.span(axis) for axis in points.T)
+        counted = [(name, f"{len(index)} particles") for name, index in self.groups.items()]
+        title = f"{type(self).__name__}: {len(self)} particles in {self.dim}D"
+        return notebooks.shown(title, [("box", box), *counted], notebooks.dots(points, kind, len(self.groups)))
 
     def tree_flatten(self):
         return (self.points, self.normals), (self.groups, self.cell_groups)

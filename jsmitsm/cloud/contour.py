@@ -218,7 +218,7 @@ def _divided_loop(
     smooth, outward = _on_level(region, smooth, spacing)
     points = np.concatenate([corners.points, smooth])
     normals = np.concatenate([corners.normals, levelset.crossing_normals(smooth, outward)])
-    kept = relaxation.uncrowded(points, spacing(points), len(after))
+    kept = relaxation.uncrowded(points, normals, spacing(points), len(after))
     return levelset.Boundary(points[kept], normals[kept])
 
 

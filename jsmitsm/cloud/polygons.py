@@ -192,7 +192,7 @@ def edge_particles(
     at, outward = np.concatenate(points), np.concatenate(normals)
     firsts = np.cumsum([0] + [len(part) for part in points[:-1]])  # the vertices that are kept
     order = np.concatenate([firsts, np.setdiff1d(np.arange(len(at)), firsts)])
-    order = order[relaxation.uncrowded(at[order], spacing(at[order]), len(firsts))]
+    order = order[relaxation.uncrowded(at[order], outward[order], spacing(at[order]), len(firsts))]
     return levelset.Boundary(at[np.sort(order)], outward[np.sort(order)])
 
 
@@ -204,7 +204,7 @@ class PolygonRegion:
     def __init__(self, loops: list[np.ndarray], spacing: Spacing):
         from scipy.spatial import cKDTree
 
-        self._loops = loops
+        self.loops = loops
         chains = [
             filling.divide(followed(a, b, spacing), spacing)[0]
             for loop in loops
@@ -226,5 +226,5 @@ class PolygonRegion:
         best = square.argmin(axis=1)
         row = np.arange(len(x))
         size = np.sqrt(square[row, best])
-        sign = np.where(_inside(x, self._loops), -1.0, 1.0)
+        sign = np.where(_inside(x, self.loops), -1.0, 1.0)
         return sign * size, away[row, best] * (sign / np.maximum(size, 1e-300))[:, None]

@@ -174,7 +174,9 @@ def _cloud(
     index = {INTERIOR: np.arange(len(inside))}
     index |= {name: members + len(inside) for name, members in named.items()}
     normals = np.concatenate([np.full(inside.shape, np.nan), boundary.normals])
-    return Cloud(np.concatenate([inside, boundary.points]), index, normals)
+    made = Cloud(np.concatenate([inside, boundary.points]), index, normals)
+    made._shape = region
+    return made
 
 
 def own_normals(

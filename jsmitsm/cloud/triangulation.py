@@ -17,8 +17,9 @@ _LONG = (3.0, 1.8)
 def simplices(cloud: Cloud) -> np.ndarray:
     """Intervals, triangles or tetrahedra (M, D + 1) between the particles, those outside of the domain dropped.
 
-    A simplex with boundary particles at all its corners lies outside where the normals point into it. Where normals
-    are missing, it is dropped if its longest edge is much longer than the usual edges of its corners.
+    A simplex with boundary particles at all its corners lies outside where the shape says so, or, where the cloud knows
+    none, where the normals point into it. Where normals are missing too, it is dropped if its longest edge is much
+    longer than the usual edges of its corners.
     Without normals the very corner of a notch may be filled, and what a particle on the very boundary sees across it.
     Those of a cloud of several regions do not cross an interface.
 
@@ -63,6 +64,14 @@ def boundary_facets(cloud: Cloud) -> tuple[np.ndarray, np.ndarray]:
     return facets, np.where(((into >= 0) & inside[into])[:, None], -normal, normal)
 
 
+def lying_on(cloud: Cloud, facets: np.ndarray) -> np.ndarray:
+    """Mask (M,) of the facets that are the boundary, not chords of it; of none where the cloud knows no shape."""
+    if cloud._shape is None or not len(facets):
+        return np.zeros(len(facets), bool)
+    points = np.asarray(cloud.points, float)
+    return np.abs(cloud._shape.distance(points[facets].mean(axis=1))[0]) < 1e-10 * np.ptp(points, axis=0).max()
+
+
 def _intervals(points: np.ndarray) -> np.ndarray:
     order = np.argsort(points[:, 0])
     return np.stack([order[:-1], order[1:]], axis=1)
@@ -97,6 +106,11 @@ def _solid(points: np.ndarray, cells: np.ndarray) -> np.ndarray:
 def _outside(cloud: Cloud, points: np.ndarray, cells: np.ndarray) -> np.ndarray:
     """Mask of the simplices that cover a hole or a notch."""
     suspect = np.isin(cells, cloud.boundary).all(axis=1)  # an interior particle proves a simplex innocent
+    if cloud._shape is not None and cloud.dim > 1:  # at the end of a side its normal says nothing of the next one
+        out, which = np.zeros(len(cells), bool), np.flatnonzero(suspect)
+        middle = np.asarray(cloud.points)[cells[which]].mean(axis=1)
+        out[which] = cloud._shape.distance(middle)[0] > 1e-9 * np.ptp(middle) if len(which) else False
+        return out
     if cloud.normals is None:
         # A cloud without any boundary shows its holes by long simplices only.
         long = _stretch(points, cells)

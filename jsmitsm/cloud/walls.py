@@ -44,6 +44,7 @@ class Walls:
     ):  # fmt: skip
         self.points, self.ids, self.interior, self.groups = points, ids, interior, groups
         self.given = normals
+        self.kept: dict[Any, np.ndarray] = {}  # what others found by looking
         self.place = np.full(len(points), -1)
         self.place[ids] = np.arange(len(ids))
 
@@ -253,8 +254,9 @@ class Walls:
         ends = ((level < 0.02) | ((level < 0.1) & away)) & (height < 0.1 * distance) & (turn < 0.9) & (turn > -0.9)
         ends &= distance < 1.6 * along[:, None]
         b, k = np.nonzero(ends)
-        owner, extra = np.concatenate([walls, walls[b]]), np.concatenate([normal, normal[near[b, k]]])
-        return owner, extra, _COVER[dim] * np.concatenate([along, along[b]])
+        lone = ends.sum(axis=1) < 2  # between two sides a corner's own normal is that of no wall
+        owner, extra = np.concatenate([walls[lone], walls[b]]), np.concatenate([normal[lone], normal[near[b, k]]])
+        return owner, extra, _COVER[dim] * np.concatenate([along[lone], along[b]])
 
 
 def nearest_seen(points: np.ndarray, size: int, which: np.ndarray | None, walls: Walls | None) -> Stencils:

@@ -64,21 +64,31 @@ def numbers(disc: Discretization, problem: Problem, taylor: Any = None, everywhe
     if disc.rec.depth and disc.linear and disc.traced.source == "variable" and disc.traced.kinked_source:
         values = -disc.traced.residuals(disc.cloud.points, params=problem.params)
         source = softened(disc, ids, source, values)
-    held = [((group.ids, k), value()) for group in disc.groups for k, value in group.held.items()]
-    own_ids, own, given = _own_numbers(disc, taylor)
+    held = _held_values(disc)
+    own_ids, own, given = _own_numbers(disc, held, taylor)
     data, gamma = _data_numbers(disc, taylor)
-    values = _filled(np.zeros(disc.held.shape), held)
-    return settled(disc, problem, Numbers(ids, jac, source, own_ids, own, given, values, data, gamma))
+    return settled(disc, problem, Numbers(ids, jac, source, own_ids, own, given, _at(disc, held), data, gamma))
 
 
 def conditions_of(disc: Discretization, problem: Problem) -> tuple[Any, Any, Any]:
     """The conditions' values (held, given, gamma; see Numbers) of another problem of the same form."""
     groups = group_conditions(problem, with_corners(problem, disc.cloud), disc.rec.order, disc.traced.order)
     other = replace(disc, groups=groups)
-    held = [((group.ids, k), value()) for group in groups for k, value in group.held.items()]
-    _, _, given = _own_numbers(other, None)
+    held = _held_values(other)
+    _, _, given = _own_numbers(other, held, None)
     _, gamma = _data_numbers(other, None)
-    return _filled(np.zeros(disc.held.shape), held), given, gamma
+    return _at(other, held), given, gamma
+
+
+def _held_values(disc: Discretization) -> list[dict[int, Any]]:
+    """Of every group the values (n,) of the fields that it holds."""
+    return [{k: value() for k, value in group.held.items()} for group in disc.groups]
+
+
+def _at(disc: Discretization, held: list[dict[int, Any]]) -> Any:
+    """The held values at their places, (N, F)."""
+    places = [((group.ids, k), value) for group, some in zip(disc.groups, held) for k, value in some.items()]
+    return _filled(np.zeros(disc.held.shape), places)
 
 
 def operator_numbers(disc: Discretization, problem: Problem, points: Any, taylor: Any) -> tuple[Any, Any]:
@@ -152,18 +162,18 @@ def _slot_values(slots: tuple[Slot, ...], rec: Recursion, taylor: Any, ids: np.n
     return None if taylor is None else slot_series(rec, slots, taylor[ids], 0)[:, 0]
 
 
-def _own_numbers(disc: Discretization, taylor: Any) -> tuple[np.ndarray, Any, Any]:
+def _own_numbers(disc: Discretization, held: list[dict[int, Any]], taylor: Any) -> tuple[np.ndarray, Any, Any]:
     """Every conditioned particle's own conditions: held values first, then the functionals."""
     slots, zero = disc.scheme.own, (0,) * disc.rec.dim
     ids = np.flatnonzero(disc.n_own)
     most = int(disc.n_own.max(initial=0))
     own: list[Any] = []
     given: list[Any] = []
-    for group in disc.groups:
+    for group, values in zip(disc.groups, held):
         at = np.searchsorted(ids, group.ids)
-        for row, (k, value) in enumerate(group.held.items()):
+        for row, (k, value) in enumerate(values.items()):
             own.append(((at, row, slots.index((k, zero))), 1.0))
-            given.append(((at, row), value()))
+            given.append(((at, row), value))
         if group.parts:
             coef, value = merged(group, slots, _slot_values(slots, disc.rec, taylor, group.ids))
             index = (at[:, None], (len(group.held) + np.arange(coef.shape[1]))[None, :])

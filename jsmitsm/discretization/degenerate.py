@@ -166,7 +166,7 @@ def _particle(
     rec = disc.rec
     # Of a recursion that goes deeper than the fit, the rows of the fit count.
     low, _, first, _ = fit_and_tail(rec)
-    matrix, lift = constraints(rec, jac, length, np)
+    matrix, lift, units = constraints(rec, jac, length, np)
     matrix, lift, lifts = matrix[np.ix_(first, low)], lift[first], row_lifts(rec, length, np)[first]
     equation = np.array([e for e, _ in rec.row_index])[first]
     size = np.where(np.any(matrix != 0, axis=1), lifts / lift, 0.0)
@@ -176,7 +176,7 @@ def _particle(
     matrix, lift = np.where(full[:, None], matrix, 0.0), np.where(full, lift, lifts / largest)
     right = np.zeros(len(lift)) if source is None else lift * source[first]
     chosen, span, slack = _independent(matrix)
-    conditions, scales = _functionals(disc, own, length)
+    conditions, scales = _functionals(disc, own, length, units)
     values = np.zeros(len(own)) if given is None else scales * given
     kept = []
     for k, row in enumerate(conditions):
@@ -216,12 +216,14 @@ def _independent(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
     return np.array(chosen, int), span, float(np.linalg.norm(rest, axis=1).max(initial=0.0))
 
 
-def _functionals(disc: Discretization, own: np.ndarray, length: float) -> tuple[np.ndarray, np.ndarray]:
+def _functionals(
+    disc: Discretization, own: np.ndarray, length: float, units: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Conditions (n, S) as rows over the scaled coefficients, of unit length, and the factors of their values."""
     rec, place = disc.rec, index_of(disc.rec.dim, disc.rec.reach)
     rows = np.zeros((len(own), rec.fields * rec.size))
     for s, (f, b) in enumerate(disc.scheme.own):
-        rows[:, f * rec.size + place[b]] += own[:, s] * factorial(b) * length ** -(sum(b) + rec.weights[f])
+        rows[:, f * rec.size + place[b]] += own[:, s] * factorial(b) * units[f] * length ** -(sum(b) + rec.weights[f])
     norm = np.linalg.norm(rows, axis=1)
     norm = np.where(norm > 0, norm, 1.0)
     return (rows / norm[:, None])[:, fit_and_tail(rec)[0]], 1.0 / norm

@@ -23,6 +23,8 @@ LEBESGUE = 1.5
 # A particle with conditions of its own (a Neumann side) is one-sided by nature: short of a healthy
 # stencil a wider one costs it more accuracy than it gains, unless the old one is as bad as this.
 HOPELESS = 10.0
+# Beyond this a stencil that could not be repaired has a weight that falls less.
+POOR = 3.0
 # A moment system that misses what is asked of it by more than this does not determine it.
 DEFECT = 1e-6
 
@@ -64,8 +66,9 @@ def repaired(
 ) -> tuple[list[Class], list[Row], Health]:
     """Give weak particles wider stencils, then balanced ones; keep the healthiest found.
 
-    Tried in turn until L <= 1.5: 1.5 and 2.2 times the neighbours, then stencils with some
-    neighbours from every direction. Particles with conditions of their own take no half measures.
+    Tried in turn until L <= 1.5: 1.5 and 2.2 times the neighbours, then stencils with some neighbours from every
+    direction. Those that stay poor are tried again with a weight that falls less. Particles with conditions of their
+    own take no half measures.
     """
     new_classes, new_rows, touched = [], [], [np.zeros(0, int)]
     # The pieces of a class are repaired together.
@@ -83,12 +86,27 @@ def repaired(
         poor = [(_some(cls, at), _take(row, at)) for cls, row, at in found if len(at)]
         if poor:
             size = max(int((cls.neighbours >= 0).sum(axis=1).max()) for cls, *_ in found)
-            cls, row, changed = _repaired(disc, nums, poor, size)
-            new_classes.append(cls)
-            new_rows.append(row)
-            touched.append(changed)
+            for cls, row, changed in _parted(disc, nums, *_repaired(disc, nums, poor, size), size):
+                new_classes.append(cls)
+                new_rows.append(row)
+                touched.append(changed)
     after = examine(new_classes, new_rows)
     return new_classes, new_rows, replace(after, repaired=np.concatenate(touched))
+
+
+def _parted(
+    disc: Discretization, nums: Numbers, cls: Class, row: Row, changed: np.ndarray, size: int
+) -> list[tuple[Class, Row, np.ndarray]]:
+    """Repaired particles, and apart from them those that stay poor, with a weight that falls less."""
+    even, weak = replace(cls.scheme, uneven=True), _score(row) > POOR
+    if cls.scheme.n_own or even.decay == cls.scheme.decay or not weak.any():
+        return [(cls, row, changed)]
+    poor = replace(_some(cls, weak), scheme=even)
+    start = class_rows(disc, nums, poor, shared_elimination(disc, nums))
+    soft = _repaired(disc, nums, [(poor, start)], size)
+    rest = _some(cls, ~weak)
+    sound = [(rest, _take(row, ~weak), np.intersect1d(changed, rest.ids))] if len(rest.ids) else []
+    return [*sound, (soft[0], soft[1], np.union1d(soft[2], np.intersect1d(changed, poor.ids)))]
 
 
 def _repaired(
@@ -102,18 +120,27 @@ def _repaired(
     near = np.concatenate([cls.neighbours for cls in classes])
     best = _Best(Row(*map(np.concatenate, zip(*rows))), near, bool(scheme.n_own))
     width = min(len(points), round(2.2 * size))
-    for attempt in (wider(1.5), wider(2.2), balanced(1.0), balanced(1.5), balanced(2.2)):
+    kept = {} if disc.walls is None else disc.walls.kept
+    for number, attempt in enumerate((wider(1.5), wider(2.2), balanced(1.0), balanced(1.5), balanced(2.2))):
         left = np.flatnonzero(best.lebesgue > LEBESGUE)
         if not len(left):
             break
         # One shape for all attempts: compiling costs far more than computing a few rows twice.
         left = np.resize(left, len(ids))
-        tried = attempt(points, ids[left], size, disc.walls)[:, :width]
+        question = number, size, ids[left].tobytes()
+        if question not in kept:
+            if len(kept) >= _KEPT:
+                kept.clear()
+            kept[question] = attempt(points, ids[left], size, disc.walls)[:, :width]
+        tried = kept[question]
         # And few shapes for all clouds.
         trial = Class(ids[left], _widened(tried, rounded_width(width, 16), 1, -1), scheme)
         best.update(left, trial.neighbours, class_rows(disc, nums, trial, shared))
     return Class(ids, best.neighbours, scheme, classes[0].wide), best.row, ids[best.changed]
 
+
+# So many attempts are kept with the walls of a cloud, for the next solve on it.
+_KEPT = 16
 
 # Moment matrices are looked at so many at a time, as many as one small program serves.
 _PIECE = 128

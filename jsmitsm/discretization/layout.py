@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import jax
@@ -14,6 +14,7 @@ from jsmitsm.cloud.neighbours import Stencils
 from jsmitsm.cloud.regions.region_cloud import RegionCloud
 from jsmitsm.cloud.walls import Walls, seen
 from jsmitsm.discretization.periodic import Images, periodic_images, with_corners
+from jsmitsm.discretization.resolution.digits import room
 from jsmitsm.discretization.supports import check_supports, cut_off, default_kernel, find_stencils, walls_of
 from jsmitsm.equation.branches import FIELD
 from jsmitsm.equation.closing import closed
@@ -31,39 +32,50 @@ from jsmitsm.runtime.compiled import at_hand
 from jsmitsm.runtime.errors import IN_FUNCTIONS, in_words
 from jsmitsm.runtime.tracers import concrete, is_traced, owned
 
+# Bytes of the user's stencils that are quickly compared.
+_LARGE = 1 << 22
+
 
 @dataclass
 class Class:
     """Particles whose moment systems have the same shape.
 
     ids (n,) ascending, neighbours (n, w), the particle itself first and -1 for none; wide: whether their stencils are
-    wider than those of most.
+    wider than those of most; kept: what others found for the class, which lasts as long as it does.
     """
 
     ids: np.ndarray
     neighbours: Any
     scheme: Scheme
     wide: bool = False
+    kept: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 
 
 @dataclass
-class Discretization:
-    """What is static about a problem on a cloud: decided once, on the host."""
+class Placed:
+    """What a discretisation takes from the cloud and from the form of the problem alone, whatever its numbers are."""
 
-    problem: Problem  # closed: nothing of it is the user's any more
-    cloud: Cloud
-    kernel: Kernel | None
-    stencils: Stencils
-    traced: Traced
-    rec: Recursion
-    groups: list[Group]
-    scheme: Scheme  # of interior particles
-    classes: list[Class]
     held: np.ndarray  # (N, F) bool, values given or taken from a periodic partner
     partner: np.ndarray  # (N,) the particle whose value each one has: itself but for periodic images
     images: Images
     n_own: np.ndarray  # (N,) own conditions of each particle
     walls: Walls | None  # what hides particles from one another
+    stencils: Stencils
+    unknowns: np.ndarray  # (N, F) the number of each unknown among all values; -1 for held ones
+    classes: list[Class]  # none until they are sorted
+
+
+@dataclass(kw_only=True)
+class Discretization(Placed):
+    """What is static about a problem on a cloud: decided once, on the host."""
+
+    problem: Problem  # closed: nothing of it is the user's any more
+    cloud: Cloud
+    kernel: Kernel | None
+    traced: Traced
+    rec: Recursion
+    groups: list[Group]
+    scheme: Scheme  # of interior particles
     given_stencils: bool  # the user's: nothing outside them is looked at
     basis_terms: int | None = None  # free coefficients kept, all of them if not given
     repeated: int = 0  # particles whose moment system was that of another
@@ -94,14 +106,6 @@ class Discretization:
         """The particles that carry equations, ascending."""
         return np.flatnonzero(~self.held.all(axis=1))
 
-    @property
-    def unknowns(self) -> np.ndarray:
-        """The number of each unknown among all values, (N, F); -1 for held ones."""
-        number = np.full(self.held.size, -1)
-        free = ~self.held.reshape(-1)
-        number[free] = np.arange(free.sum())
-        return number.reshape(self.held.shape)[self.partner]
-
 
 def discretize(
     problem: Problem, cloud: Cloud, method: str, order: int, kernel: Kernel | None,
@@ -124,21 +128,11 @@ def discretize(
     flat = traced.constant and rec.scale_free
     if depth == "auto":
         depth = suited_depth(method, rec, flat, sourced)
+        depth = depth and min(depth, room(rec, order, traced, cloud, problem.params))
     rec = recursion(cloud.dim, order, problem.fields, traced.slots, traced.pattern, traced.order, int(depth))
     groups = group_conditions(problem, with_corners(problem, cloud), order, traced.order)
-    held = np.zeros((len(cloud), problem.fields), bool)
-    for group in groups:
-        for k in group.held:
-            held[group.ids, k] = True
-    images, partner = periodic_images(problem, cloud)
-    held[partner != np.arange(len(cloud))] = True
-    n_own = np.zeros(len(cloud), int)
-    for group in groups:
-        n_own[group.ids] = group.n_rows + len(group.held)
     scheme = _scheme(method, rec, traced, problem, cloud, basis_terms)
     scheme = replace(scheme, **_conditions_layout(groups, rec), sourced=sourced, flat=flat)
-    if len(images.owner) and method in ("I", "II"):
-        raise ValueError(f"method: {method} does not follow periodic conditions; use S, III or SSPH")
     if scheme.n_data and method in ("I", "II", "III"):
         raise ValueError(
             f"method: {method} takes one condition where values are held, but a boundary has more (as a clamped "
@@ -154,28 +148,62 @@ def discretize(
         raise ValueError(
             f"kernel: the derivatives of js.Constant vanish, and method {method} tests with them; use another kernel"
         )
-    given_stencils, walls = stencils is not None, walls_of(problem, cloud, images)
-    if stencils is None:
-        conditioned = np.flatnonzero((n_own > 0) & ~held.all(axis=1))
-        stencils = find_stencils(cloud, kernel, scheme, images, conditioned, walls)
-    elif len(stencils) != len(cloud):
-        raise ValueError(f"stencils: built for {len(stencils)} particles, the cloud has {len(cloud)}; build them again")
-    elif stencils.radius is not None and not is_traced(stencils):  # those of a former solve were looked at then
-        stencils = seen(stencils, None, walls)
+    given_stencils = stencils is not None
+    place = _placed(problem, cloud, kernel, stencils, scheme, groups)
     if kernel is None and method in ("I", "II"):
-        kernel = default_kernel(cloud.points, np.arange(len(cloud)), stencils.indices)
+        kernel = default_kernel(cloud.points, np.arange(len(cloud)), place.stencils.indices)
     disc = Discretization(
-        problem, cloud, kernel, stencils, traced, rec, groups, scheme, [], held, partner, images, n_own, walls,
-        given_stencils,        basis_terms,
+        problem=problem, cloud=cloud, kernel=kernel, traced=traced, rec=rec, groups=groups, scheme=scheme,
+        given_stencils=given_stencils, basis_terms=basis_terms, **vars(place),
     )  # fmt: skip
     if given_stencils or kernel is not None:
-        check_supports(scheme, stencils, kernel, disc.points, n_own, disc.active)
+        check_supports(scheme, disc.stencils, kernel, disc.points, disc.n_own, disc.active)
     if given_stencils and kernel is not None:
-        disc.cut_off = cut_off(stencils, kernel, disc.points, disc.active)
-    disc.classes = sorted_classes(disc, disc.active, stencils)
+        disc.cut_off = cut_off(disc.stencils, kernel, disc.points, disc.active)
+    place.classes = place.classes or sorted_classes(disc, disc.active, disc.stencils)
+    disc.classes = list(place.classes)
     if traced.branches is not None and not traced.branches.depends & FIELD:
         refuse_jumps(disc, problem)
     return disc
+
+
+def _placed(
+    problem: Problem, cloud: Cloud, kernel: Kernel | None, stencils: Stencils | None, scheme: Scheme,
+    groups: list[Group],
+) -> Placed:  # fmt: skip
+    """Who is held, who is whose neighbour: kept with the cloud, where all that decides is the same."""
+    pairs = tuple(dict.fromkeys(c.groups for cs in problem.bcs.values() for c in cs if c.kind == "periodic"))
+    conditions = tuple((g.name, g.ids.tobytes(), tuple(g.held), g.n_rows) for g in groups)
+
+    def place() -> Placed:
+        held = np.zeros((len(cloud), problem.fields), bool)
+        n_own = np.zeros(len(cloud), int)
+        for group in groups:
+            held[group.ids[:, None], list(group.held)] = True
+            n_own[group.ids] = group.n_rows + len(group.held)
+        images, partner = periodic_images(problem, cloud)
+        held[partner != np.arange(len(cloud))] = True
+        if len(images.owner) and scheme.method in ("I", "II"):
+            raise ValueError(f"method: {scheme.method} does not follow periodic conditions; use S, III or SSPH")
+        walls, found = walls_of(problem, cloud, images), stencils
+        if found is None:
+            conditioned = np.flatnonzero((n_own > 0) & ~held.all(axis=1))
+            found = find_stencils(cloud, kernel, scheme, images, conditioned, walls)
+        elif len(found) != len(cloud):
+            raise ValueError(
+                f"stencils: built for {len(found)} particles, the cloud has {len(cloud)}; build them again"
+            )
+        elif found.radius is not None and not is_traced(found):  # those of a former solve were looked at then
+            found = seen(found, None, walls)
+        free = ~held.reshape(-1)
+        unknowns = np.where(free, np.cumsum(free) - 1, -1).reshape(held.shape)[partner]
+        return Placed(held, partner, images, n_own, walls, found, unknowns, [])
+
+    given = [] if stencils is None else jax.tree.leaves(stencils)
+    if is_traced(given) or (stencils is None and kernel is not None) or sum(x.nbytes for x in given) > _LARGE:
+        return place()
+    numbers = tuple((x.shape, x.dtype.str, x.tobytes()) for x in map(np.asarray, given))
+    return cloud.kept((scheme, conditions, pairs, numbers), place)
 
 
 def suited_depth(method: str, rec: Recursion, flat: bool, sourced: bool) -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -18,36 +18,61 @@ from jsmitsm.runtime.whole_program import in_one_program
 
 def matrix(disc: Discretization, classes: list[Class], rows: list[Row]) -> tuple[Any, Any, Any]:
     """The global matrix as coordinates: own u_i - sum_g weights u_g over the unknowns."""
-    unknown, fields = disc.unknowns, disc.rec.fields
-    parts: list[Any] = []
-    places: list[Any] = []
-    for cls, row in zip(classes, rows, strict=True):
-        near = disc.images.owners(cls.neighbours)
-        xp: Any = jnp if is_traced(near) else np
-        number = xp.asarray(unknown)
-        own = unknown[cls.ids]
-        col = xp.where((near >= 0)[..., None], number[near], -1)  # (n, w, F)
-        shape = (len(cls.ids), fields, near.shape[1], fields)
-        r = np.broadcast_to(own[:, :, None, None], shape)
-        c = xp.broadcast_to(col[:, None], shape)
-        keep = (r >= 0) & (c >= 0)
-        if is_traced(near):
-            parts.append(
-                (
-                    jnp.where(keep, -row.weights, 0.0).ravel(),
-                    jnp.where(keep, r, 0).ravel(),
-                    jnp.where(keep, c, 0).ravel(),
-                )
-            )
-        else:
-            places.append(np.flatnonzero(keep))
-            parts.append((row.weights, *(x.reshape(-1)[places[-1]] for x in (r, c))))
-    n = int(unknown.max(initial=-1)) + 1 if disc.scheme.method != "SSPH" else 0
-    ones, every = np.ones(n), np.arange(n)
+    if is_traced([cls.neighbours for cls in classes]):
+        return joined([*(_traced_entries(disc, cls, row) for cls, row in zip(classes, rows, strict=True)), _ones(disc)])
+    places = [_places(disc, cls) for cls in classes]
+    ones, every, _ = _ones(disc)
     if not places:
-        return joined([*parts, (ones, every, every)])
-    weights, at, to = zip(*parts)
-    return _entries(weights, places, ones), np.concatenate([*at, every]), np.concatenate([*to, every])
+        return ones, every, every
+    found = _entries([row.weights for row in rows], [p.kept for p in places], ones)
+    at, to = ([getattr(p, name) for p in places] for name in ("at", "to"))
+    return found, np.concatenate([*at, every]), np.concatenate([*to, every])
+
+
+def _ones(disc: Discretization) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The diagonal of ones."""
+    n = int(disc.unknowns.max(initial=-1)) + 1 if disc.scheme.method != "SSPH" else 0
+    return np.ones(n), np.arange(n), np.arange(n)
+
+
+class _Places(NamedTuple):
+    """Where the rows of a class stand in the global system."""
+
+    unknown: np.ndarray  # what the numbers are of
+    kept: np.ndarray  # the weights (flat) that stand in the matrix
+    at: np.ndarray  # their rows
+    to: np.ndarray  # and columns
+
+
+# So many weights at the most are worth keeping their places.
+_KEPT = 1 << 18
+
+
+def _places(disc: Discretization, cls: Class) -> _Places:
+    found = cls.kept.get("places")
+    if found is not None and found.unknown is disc.unknowns:
+        return found
+    unknown, near = disc.unknowns, disc.images.owners(cls.neighbours)
+    own = unknown[cls.ids]
+    column = np.where((near >= 0)[..., None], unknown[near], -1)[:, None]  # (n, 1, w, F)
+    shape = (*own.shape, *column.shape[2:])
+    rows, columns = np.broadcast_to(own[:, :, None, None], shape), np.broadcast_to(column, shape)
+    kept = np.flatnonzero((rows >= 0) & (columns >= 0))
+    made = _Places(unknown, kept, rows.reshape(-1)[kept], columns.reshape(-1)[kept])
+    if rows.size <= _KEPT:
+        cls.kept["places"] = made
+    return made
+
+
+def _traced_entries(disc: Discretization, cls: Class, row: Row) -> tuple[Any, Any, Any]:
+    """The entries of one class among neighbours that JAX traces, zero where there are none."""
+    unknown, near = disc.unknowns, disc.images.owners(cls.neighbours)
+    own = unknown[cls.ids]
+    column = jnp.where((near >= 0)[..., None], jnp.asarray(unknown)[near], -1)
+    shape = (*own.shape, *column.shape[1:])
+    r, c = np.broadcast_to(own[:, :, None, None], shape), jnp.broadcast_to(column[:, None], shape)
+    keep = (r >= 0) & (c >= 0)
+    return tuple(jnp.where(keep, x, 0).ravel() for x in (-row.weights, r, c))
 
 
 @in_one_program
@@ -67,14 +92,13 @@ def joined(parts: Sequence[tuple[Any, Any, Any]]) -> tuple[Any, Any, Any]:
 
 def right_side(disc: Discretization, nums: Numbers, classes: list[Class], rows: list[Row]) -> Any:
     """The global right-hand side (n,): source, own conditions and held neighbours."""
-    unknown = disc.unknowns
     parts, places = [], []
     for cls, row in zip(classes, rows, strict=True):
         source, given = right_sides(disc, nums, cls)
-        near = disc.images.owners(cls.neighbours)
-        own = unknown[cls.ids]
-        parts.append((row, source if cls.scheme.sourced else None, given, near, np.flatnonzero(own >= 0)))
-        places.append(own[own >= 0])
+        near, own = disc.images.owners(cls.neighbours), disc.unknowns[cls.ids].reshape(-1)
+        free = np.flatnonzero(own >= 0)
+        parts.append((row, source if cls.scheme.sourced else None, given, near, free))
+        places.append(own[free])
     return loads(parts, nums.held, nums.gamma, np.argsort(np.concatenate(places))) if parts else np.zeros(0)
 
 

@@ -59,7 +59,8 @@ def _closed_condition(problem: Problem, c: Condition, dim: int, where: str) -> C
 def recorded_values(function: Callable[..., Any], dim: int, params: Any, components: int, where: str) -> Traced:
     arguments = "x" if params is None else "x, params"
     with _named(where, f"a function of {arguments} that returns a scalar"):
-        return trace(lambda u, x, *p: _shaped(function(x, *p), components, where), dim, components, params=params)
+        # Without the condition's name: a function on several sides is recorded once.
+        return trace(lambda u, x, *p: _shaped(function(x, *p), components), dim, components, params=params)
 
 
 def recorded_residual(residual: Callable[..., Any], dim: int, problem: Problem, where: str) -> Traced:
@@ -86,20 +87,26 @@ def _named(where: str, expected: str) -> Iterator[None]:
     """Say which of the user's functions failed, and what was expected of it."""
     try:
         yield
+    except _NoValue as error:
+        raise ValueError(f"{where}: {error}") from None
     except IN_FUNCTIONS as error:
         if str(error).startswith(where):
             raise
         raise ValueError(f"{where}: expected {expected}; calling it failed: {in_words(error)}") from error
 
 
-def _shaped(result: Any, components: int, where: str) -> Any:
+class _NoValue(ValueError):
+    """A function returned what is no value of a condition."""
+
+
+def _shaped(result: Any, components: int) -> Any:
     if jnp.iscomplexobj(result):
-        raise ValueError(
-            f"{where}: expected real numbers, got complex ones; take jnp.real of them or js.Problem(..., dtype=complex)"
+        raise _NoValue(
+            "expected real numbers, got complex ones; take jnp.real of them or js.Problem(..., dtype=complex)"
         )
     result = jnp.asarray(result, float)
     if result.size == components and result.ndim <= 1:
         return result.reshape((components,) if components > 1 else ())
     if result.ndim == 0:
         return jnp.full((components,), result)
-    raise ValueError(f"{where}: expected a function of one point x (D,) returning a scalar, got shape {result.shape}")
+    raise _NoValue(f"expected a function of one point x (D,) returning a scalar, got shape {result.shape}")

@@ -64,11 +64,12 @@ def interpret(jaxpr: Any, consts: Sequence[Facts], args: Sequence[Facts]) -> lis
         return known(literal(v)) if isinstance(v, Literal) else env[v]
 
     for eqn in jaxpr.eqns:
-        env.update(zip(eqn.outvars, _step(eqn, [read(v) for v in eqn.invars]), strict=True))
+        env.update(zip(eqn.outvars, facts_of(eqn, [read(v) for v in eqn.invars]), strict=True))
     return [read(v) for v in jaxpr.outvars]
 
 
-def _step(eqn: Any, facts: list[Facts]) -> list[Facts]:
+def facts_of(eqn: Any, facts: list[Facts]) -> list[Facts]:
+    """Facts about the results of one operation."""
     name = eqn.primitive.name
     inner = called(eqn)
     if inner is not None:

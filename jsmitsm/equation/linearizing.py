@@ -12,6 +12,7 @@ import numpy as np
 from jax.extend.core import Literal
 
 from jsmitsm.equation.field import Field, LocalField, field_p, frozen_p
+from jsmitsm.equation.folding import folded
 from jsmitsm.equation.marks import DIFFERENTIATED
 from jsmitsm.runtime.jaxprs import EVERYTHING, bind, called, inner_jaxprs, levels, literal, program, scan_sizes
 from jsmitsm.runtime.snapshot import snapshot
@@ -343,7 +344,7 @@ def record(
     # The constants of the first trace are the last inputs of the third; make them constants again.
     made = program(third, last=len(flat.constvars))
     kept = tuple(map(owned, (*third.consts, *first.consts)))  # the user may change the arrays in place
-    return Record(made, kept, ordered, tuple(outputs), flat.outvars[0].aval.shape[0], flat)
+    return Record(folded(made), kept, ordered, tuple(outputs), flat.outvars[0].aval.shape[0], flat)
 
 
 def _shaped(v: Any) -> jax.ShapeDtypeStruct:

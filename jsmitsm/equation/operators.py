@@ -311,8 +311,8 @@ def _along(function: Callable[[Any], Any], axis: int) -> Callable[[Any], Any]:
         return checkpoint_name(function(y), f"{DIFFERENTIATED}{axis}")
 
     def slope(y: Any) -> Any:
-        direction = np.zeros(len(y), y.dtype)
-        direction[axis] = 1
+        # By operations, not as an array: of arrays nobody may assume that their numbers stay.
+        direction = (jax.lax.iota(np.int32, len(y)) == axis).astype(y.dtype)
         with jax.named_scope(ALONG):
             return jax.jvp(named, (y,), (direction,))[1]
 

@@ -14,6 +14,7 @@ from jsmitsm.equation.traced import Traced
 from jsmitsm.equation.unknowns.constraint import Constraint
 from jsmitsm.equation.unknowns.extras import Extras, extras
 from jsmitsm.equation.unknowns.point_source import PointSource
+from jsmitsm.runtime import notebooks
 from jsmitsm.runtime.errors import did_you_mean, short
 
 
@@ -166,6 +167,13 @@ class Problem:
         shown = ", ".join(f"{name}: {', '.join(map(repr, value))}" for name, value in self.bcs.items())
         of = f"regions={list(self.pde)}, " if isinstance(self.pde, PerRegion) else ""
         return f"Problem({of}fields={self.fields}, {shown})"
+
+    def _repr_html_(self) -> str:
+        rows = [("fields", self.fields), *((name, ", ".join(map(repr, held))) for name, held in self.bcs.items())]
+        if isinstance(self.pde, PerRegion):
+            rows.insert(0, ("regions", ", ".join(self.pde)))
+        rows += [] if self.params is None else [("params", short(self.params))]
+        return notebooks.shown("Problem", rows)
 
 
 def _check_params(params: Any, complex_too: bool) -> None:

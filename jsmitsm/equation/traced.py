@@ -17,16 +17,18 @@ from jsmitsm.equation.branches import Branches
 from jsmitsm.equation.jumps import jumps
 from jsmitsm.equation.linearizing import Record
 from jsmitsm.equation.record_form import Form, is_fixed
-from jsmitsm.runtime.compiled import fingerprint, kept
+from jsmitsm.runtime.compiled import Same, fingerprint, kept, remembered
 from jsmitsm.runtime.jaxprs import EVERYTHING, NOTHING, inner_jaxprs, levels
-from jsmitsm.runtime.tracers import any_number, is_traced
+from jsmitsm.runtime.tracers import any_number, frozen, is_traced
 from jsmitsm.runtime.whole_program import in_one_program
 from jsmitsm.taylor.jets import evaluate, plain
 from jsmitsm.taylor.multi_indices import Slot, count
 from jsmitsm.taylor.series import Ring, full_series, variable
 
-# Particles interpreted at a time on the host: the temporaries stay in cache.  Fewer where arrays are wide.
-CHUNK = 4096
+# Numbers up to which what a record is evaluated on is compared with what it was before.
+REMEMBERED = 6000
+# Numbers of a series interpreted at a time on the host, but always so many particles: the temporaries stay in cache.
+CHUNK, LEAST = 60_000, 512
 # How many programs were traced for compilation since import; tests watch it.
 COMPILATIONS = 0
 # Operations on floats whose value or slope may jump; look-ups in tables are among them.
@@ -103,12 +105,45 @@ class Traced:
         inputs = self._inputs(points, degree, extras, params, slots)
         if not self.linear:
             return self._compute(inputs, degree, True, True)
+        given = None if slots is not None else self._given(inputs)
+        if given is None:
+            return self._linear(inputs, degree)
+        made = lambda: jax.tree.map(frozen, self._linear(inputs, degree))  # noqa: E731
+        return remembered((Same(self), degree, given), made)
+
+    def _given(self, inputs: _Inputs) -> Any:
+        """What a linear record is evaluated on, by its numbers; None where that is much, or traced."""
+        some = [inputs.points, *inputs.extras, *inputs.leaves]
+        if is_traced(some, inputs.consts) or sum(np.size(x) for x in some) > REMEMBERED:
+            return None
+        return tuple((x.shape, x.dtype.str, x.tobytes()) for x in map(np.asarray, some))
+
+    def _linear(self, inputs: _Inputs, degree: int) -> tuple[Any, Any]:
         # Apart: a coefficient that rests on nothing traced stays on the host.
-        first = inputs._replace(points=points[:1], extras=[e[:1] for e in inputs.extras]) if self.constant else inputs
-        jac, _ = self._compute(first, 0 if self.constant else degree, True, False)
-        if self.source == "zero" and slots is None:
+        jac = self._one_for_all(inputs) if self.constant else self._compute(inputs, degree, True, False)[0]
+        if self.source == "zero" and inputs.slots is None:
             return jac, None
         return jac, self._compute(inputs, degree, False, True)[1]
+
+    def _one_for_all(self, inputs: _Inputs) -> Any:
+        """The coefficients (E, S, 1, 1) of a constant operator, kept where they are plain numbers."""
+        if self._numbers is not None:
+            return self._numbers
+        one = inputs._replace(points=inputs.points[:1], extras=[e[:1] for e in inputs.extras])
+        return self._compute(one, 0, True, False)[0]
+
+    @cached_property
+    def _numbers(self) -> np.ndarray | None:
+        """The coefficients of an operator that rest on nothing at all."""
+        read = self._read(True, False)
+        consts = [c for k, c in enumerate(self._record.consts) if ("consts", k) in read]
+        if any(name != "consts" for name, _ in read) or is_traced(consts):
+            return None
+        rest = [v.aval for v in self._record.jaxpr.invars[1 + len(self._record.slots) :]]
+        zeros = [np.zeros((1, *a.shape)) for a in rest[: self._n_extras]]
+        leaves = [np.zeros(a.shape, a.dtype) for a in rest[self._n_extras :]]
+        inputs = _Inputs(np.zeros((1, self.dim)), zeros, leaves, list(self._record.consts), None)
+        return frozen(self._compute(inputs, 0, True, False)[0])
 
     def residuals(self, points: Any, *, params: Any = None, slots: Any = None) -> Any:
         """The residual alone (E, N) at the points, where the slots' derivatives are ``slots`` (S, N) or zero."""
@@ -169,7 +204,7 @@ class Traced:
     def _on_host(self, inputs: _Inputs, degree: int, jac: bool, res: bool) -> tuple[Any, Any]:
         """In numpy, some particles at a time."""
         n = len(inputs.points)
-        size = max(CHUNK // self._width, CHUNK // 8, 1)
+        size = max(CHUNK // (self._width * count(self.dim, degree)), LEAST)
         parts = [self._series(inputs.chunk(low, size), degree, jac, res) for low in range(0, max(n, 1), size)]
         if len(parts) == 1:
             return parts[0]
@@ -191,6 +226,13 @@ class Traced:
 
     def _read(self, jac: bool, res: bool) -> set[Any]:
         """The inputs that the wanted outputs really rest on."""
+        return self._reads[jac, res]
+
+    @cached_property
+    def _reads(self) -> dict[tuple[bool, bool], set[Any]]:
+        return {some: self._found_read(*some) for some in ((True, False), (False, True), (True, True))}
+
+    def _found_read(self, jac: bool, res: bool) -> set[Any]:
         jaxpr, wanted = self._record.jaxpr, self._wanted(jac, res)
         read = {v for v, w in zip(jaxpr.outvars, wanted, strict=True) if w and not isinstance(v, Literal)}
         for eqn, _ in levels(jaxpr, wanted):

@@ -15,6 +15,7 @@ from jsmitsm.equation.dependence import EXTRAS, FIELD, JUMPS, POINT, Facts
 from jsmitsm.equation.field import local_field
 from jsmitsm.equation.linearizing import Record, record
 from jsmitsm.equation.traced import Traced
+from jsmitsm.runtime.collector import uncollected
 from jsmitsm.runtime.recall.recording import recalled
 from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.taylor.multi_indices import Slot
@@ -52,7 +53,9 @@ def trace(
     rest = dim, fields, tuple(extras), tree, tuple((v.shape, v.dtype, v.weak_type) for v in map(jax.typeof, leaves))
 
     def make() -> Traced:
-        return _classified(record(residual, local_field(dim, fields), extras, params), dim, fields, len(extras), tree)
+        with uncollected():
+            made = record(residual, local_field(dim, fields), extras, params)
+            return _classified(made, dim, fields, len(extras), tree)
 
     if not _is_plain(tree):
         return make()

@@ -12,7 +12,9 @@ import numpy as np
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.evolution.space.local_fits import StateFit
 from jsmitsm.evolution.steps import dense_output
+from jsmitsm.runtime import notebooks
 from jsmitsm.runtime.arrays import Array
+from jsmitsm.runtime.errors import explained
 from jsmitsm.runtime.tracers import frozen, is_traced
 from jsmitsm.solution.fit import Recipe
 from jsmitsm.solution.solution import Solution
@@ -81,7 +83,7 @@ class Evolution:
     @property
     def flags(self) -> list[str]:
         """What speaks against this evolution, a sentence each."""
-        return [] if self._report is None else list(self._report.flags)
+        return [] if self._report is None else explained(self._report.flags)
 
     def diagnose(self) -> str:
         """In words: how the run went.
@@ -212,6 +214,17 @@ class Evolution:
             return f"Evolution(u: {shape})"
         ends = f"t: {float(np.min(self.t)):g} to {float(np.max(self.t)):g}"
         return f"Evolution({ends}, u: {shape}, converged={bool(np.all(self.converged))})"
+
+    def _repr_html_(self) -> str:
+        if is_traced(self.t, self.u, self.converged) or np.ndim(self.t) != 1:
+            return repr(self)
+        last = np.asarray(self.u)[-1].reshape(len(self.cloud), -1)
+        rows: list[tuple[str, Any]] = [("t", f"{notebooks.span(self.t)}, {len(self.t)} saved")]
+        rows.append(("particles", len(self.cloud)))
+        rows += [(f"u[{k}] at the end" if last.shape[1] > 1 else "u at the end", notebooks.span(v))
+                 for k, v in enumerate(last.T)]  # fmt: skip
+        rows += [("converged", bool(np.all(self.converged))), ("flags", " ".join(self.flags) or "none")]
+        return notebooks.shown("Evolution", rows, notebooks.dots(np.asarray(self.cloud.points), last[:, 0], 0))
 
     def to_xarray(self) -> Any:
         """The saved states as a data set with the dimensions time, particle (and field).

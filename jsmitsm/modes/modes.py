@@ -15,7 +15,7 @@ from jsmitsm.modes.estimate import errors
 from jsmitsm.modes.question import Question, mass_at
 from jsmitsm.modes.spectrum import Pairs
 from jsmitsm.runtime.arrays import Array, ArrayLike
-from jsmitsm.runtime.errors import short, some
+from jsmitsm.runtime.errors import explained, short, some
 from jsmitsm.runtime.tracers import frozen, is_traced, owned
 from jsmitsm.solution.fit import Fit, Recipe
 from jsmitsm.solution.solution import Solution
@@ -306,7 +306,7 @@ class Modes:
                 "times, since the operator is far from self-adjoint, as strong convection makes it: the error estimate "
                 "says little; write u = exp(b . x / 2) v for a drift b, or compare with a finer cloud."
             )
-        return out
+        return explained(out)
 
     def _conditions(self) -> np.ndarray:
         """The condition numbers (k,) of the values: the sizes of both vectors where their product is one."""

@@ -26,7 +26,7 @@ from jsmitsm.runtime.compiled import at_hand
 from jsmitsm.runtime.compiler_options import on_cpu
 from jsmitsm.runtime.size_classes import BLOCK, FEW, cloud_size, padded_size
 from jsmitsm.runtime.tracers import closes_over_traced, is_traced, recorded
-from jsmitsm.runtime.whole_program import called, in_one_program, only_run
+from jsmitsm.runtime.whole_program import COUNT, called, in_one_program, only_run
 
 # A GPU is filled by many at once; these take some hundred megabytes.
 _WIDE = 8192
@@ -43,7 +43,7 @@ _EFFORT = (
 )
 # Up to so many Taylor coefficients, or so many where all share an elimination, one kernel is faster than many and
 # a library's matrix products.
-_SMALL, _SMALL_SHARED = 32, 45
+_SMALL, _SMALL_SHARED = 32, 66
 
 # How often the local phase was compiled; read by the tests.
 TRACES = {"rows": 0, "coefficients": 0}
@@ -106,6 +106,16 @@ def effort(size: int) -> Any:
     return on_cpu(next(some for most, some in _EFFORT if size <= most))
 
 
+def _by_row(points: Any, kernel: Any, ids: Any, neighbours: Any, given: Operands, each: Any, whole: Any) -> Any:
+    """Which of the arguments have a row for each particle of the class; COUNT for the number of these."""
+    no, yes = (lambda tree, flag=flag: jax.tree.map(lambda _: flag, tree) for flag in (False, True))
+    own = Operands(
+        (no if given.jac.shape[0] == 1 else yes)(given.jac), yes(given.own), no(given.data), no(given.shared),
+        no(given.lengths), COUNT,
+    )  # fmt: skip
+    return no(points), no(kernel), yes(ids), yes(neighbours), own, yes(each), no(whole)
+
+
 def _in_size_classes(function: Any) -> Any:
     """Compile ``function(scheme, points, kernel, ids, neighbours, operands, each, whole)``, and call it
     with every particle axis padded: that of ``ids``, and that of the cloud."""
@@ -135,7 +145,8 @@ def _in_size_classes(function: Any) -> Any:
         options = effort(size)
         most = _SMALL if operands.shared is None else _SMALL_SHARED
         small = scheme.rec.size * scheme.rec.fields <= most and one_kernel.available()
-        return cut(called(function, {"scheme": scheme}, arguments, tuple(options.items()), small), m)
+        share = None if loose else dict(zip(names, _by_row(points, kernel, ids, neighbours, given, each, whole)))
+        return cut(called(function, {"scheme": scheme}, arguments, tuple(options.items()), small, share), m)
 
     return padded
 

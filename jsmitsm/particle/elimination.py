@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm.particle.polynomials import whitening
-from jsmitsm.particle.recursion import Recursion, constraints, fit_and_tail, row_lifts, substitution
+from jsmitsm.particle.recursion import FitAndTail, Recursion, constraints, fit_and_tail, row_lifts, substitution
 from jsmitsm.particle.small_systems import definite_inverse, gram_matrix, independent, null_space, product
 from jsmitsm.taylor.multi_indices import Slot, factorial, multi_indices
 
@@ -47,6 +47,7 @@ class Scheme:
     flat : whether the homogeneous local solutions end with the fit: those of a constant operator whose terms are all
         of one order are sums of homogeneous polynomials.
     lost : rows of the recursion that add nothing to the others, where the equation degenerates.
+    uneven : whether the particles' neighbours are too unevenly spread for the fit to be drawn to the near ones.
     """
 
     method: str
@@ -60,21 +61,23 @@ class Scheme:
     sourced: bool = True
     lost: int = 0
     flat: bool = False
+    uneven: bool = False
 
     @property
     def decay(self) -> float:
         """Without a kernel the weight is exp(-(decay r / r_max)^2). Deeper polynomials are true farther out, and
         measured best when the fit is drawn to the near ones."""
-        return 2.5 if self.rec.depth and self.rec.order >= 3 else 2.0
+        return 2.5 if self.rec.depth and self.rec.order >= 3 and not self.uneven else 2.0
 
 
 class Elimination(NamedTuple):
     """U = Q F + B c: the local solutions, and the lengths by which the constraints were divided."""
 
     basis: Any  # (F K, free)
-    particular: Any  # (F K, rows)
+    particular: Any  # (F K, rows), or Deep
     lift: Any  # (rows,)
     rows: Any  # (F, F K): the equations themselves, needed by collocation
+    units: Any  # (F,): of the fields, beside powers of the length
 
 
 @lru_cache(maxsize=64)
@@ -101,11 +104,11 @@ def eliminate(scheme: Scheme, jac: Any, length: Any) -> Elimination:
     jac (E, S, T). Method S and SSPH use polynomials that are orthonormal over the support.
     """
     rec = scheme.rec
-    matrix, lift = constraints(rec, jac, length)
+    matrix, lift, units = constraints(rec, jac, length)
     rows = matrix[np.array(rec.equation_rows)]
     white = jnp.asarray(_whitening(rec))
     if scheme.method == "SSPH":
-        return Elimination(white, jnp.zeros((white.shape[0], matrix.shape[0])), lift, rows)
+        return Elimination(white, jnp.zeros((white.shape[0], matrix.shape[0])), lift, rows, units)
     low, _, first, _ = fit_and_tail(rec)
     fitted = matrix if not rec.depth else matrix[first][:, low]
     if scheme.method == "S":
@@ -120,36 +123,77 @@ def eliminate(scheme: Scheme, jac: Any, length: Any) -> Elimination:
         z = z[:, : len(scheme.free)]
     if rec.depth:
         z, q = _deepened(scheme, matrix, z, q)
-    return Elimination(z, q, lift, rows)
+    return Elimination(z, q, lift, rows, units)
 
 
-def _deepened(scheme: Scheme, matrix: Any, basis: Any, particular: Any) -> tuple[Any, Any]:
-    """Local solutions (F K, free) and (F K, rows) of all degrees, from those of the fit's."""
-    rec = scheme.rec
-    low, high, first, deeper = fit_and_tail(rec)
-    size = jnp.asarray(_fischer(rec)[high])
-    across, deep = matrix[deeper][:, low], matrix[deeper][:, high] * size
-    unit = _row_lengths(deep, jnp)[:, None]
-    spread = (deep / unit).T
+@dataclass(frozen=True)
+class Deep:
+    """The particular solutions (F K, rows) of a recursion deeper than the fit, in parts: most of them are asked for
+    their products with a vector or two alone, and a matrix of them all takes as long to make as everything else.
+    """
+
+    fitted: Any  # (low columns, low rows): Q of the fit
+    across: Any  # (deep rows, low columns): M_hl
+    tail: Any  # (high columns, deep rows): D A^T, A with rows of unit length
+    inverse: Any  # (deep rows, deep rows): (A A^T)^-1 with a ridge
+    unit: Any  # (deep rows,): the lengths of the rows of M_hh D
+    place: FitAndTail  # of columns and rows among all
+    shape: tuple[int, int]
+
+    def extended(self, missing: Any) -> Any:
+        """The tail (high columns, m) that follows from what the deep equations miss (deep rows, m)."""
+        return product(self.tail, product(self.inverse, missing / self.unit[:, None]))
+
+    def __matmul__(self, sides: Any) -> Any:
+        """(rows,) or (rows, m) to (F K,) or (F K, m)."""
+        if sides.ndim == 1:
+            return (self @ sides[:, None])[:, 0]
+        low = product(self.fitted, _rows_of(sides, self.place.first))
+        high = self.extended(_rows_of(sides, self.place.deeper) - product(self.across, low))
+        return _joined(low, high, self.place.low, self.place.high, self.shape[0])
+
+    def transposed(self, wanted: Any) -> Any:
+        """(F K, m) to (rows, m)."""
+        high = product(self.tail.T, _rows_of(wanted, self.place.high))
+        deeper = product(self.inverse, high) / self.unit[:, None]
+        low = _rows_of(wanted, self.place.low) - product(self.across.T, deeper)
+        return _joined(product(self.fitted.T, low), deeper, self.place.first, self.place.deeper, self.shape[1])
+
+
+def transposed(particular: Any, wanted: Any) -> Any:
+    """particular^T wanted, for a matrix of particular solutions or the parts of one: (rows, m)."""
+    return particular.transposed(wanted) if isinstance(particular, Deep) else particular.T @ wanted
+
+
+def _deepened(scheme: Scheme, matrix: Any, basis: Any, particular: Any) -> tuple[Any, Deep]:
+    """Local solutions (F K, free) of all degrees, from those of the fit's, and the particular ones."""
+    place = fit_and_tail(scheme.rec)
+    rows = _rows_of(matrix, place.deeper)
+    across, deep = (_rows_of(rows.T, at).T for at in (place.low, place.high))
+    size = jnp.asarray(_fischer(scheme.rec)[place.high])
+    deep = deep * size
+    unit = _row_lengths(deep, jnp)
+    spread = (deep / unit[:, None]).T
     # The ridge bounds the condition of the Gram matrix: its inverse needs no refinement.
-    inverse = definite_inverse(gram_matrix(spread) + _ridge(scheme) * np.eye(len(deeper)))
-    extension = product(size[:, None] * spread, inverse / unit.T)
-    follows = -product(extension, product(across, jnp.concatenate([basis, particular], axis=1)))
-    free, unused = basis.shape[1], matrix.shape[1] - len(low) - len(high)
-    whole = jnp.concatenate([basis, follows[:, :free]])
-    source = jnp.concatenate([
-        jnp.pad(particular, ((0, 0), (0, len(deeper)))), jnp.concatenate([follows[:, free:], extension], axis=1)
-    ])  # fmt: skip
-    whole, source = (_in_order(jnp.pad(x, ((0, unused), (0, 0))), low, high) for x in (whole, source))
-    return whole, _in_order(source.T, first, deeper).T
+    inverse = definite_inverse(gram_matrix(spread) + _ridge(scheme) * np.eye(len(place.deeper)))
+    made = Deep(particular, across, size[:, None] * spread, inverse, unit, place, (matrix.shape[1], matrix.shape[0]))
+    tail = made.extended(-product(across, basis))
+    return _joined(basis, tail, place.low, place.high, matrix.shape[1]), made
 
 
-def _in_order(matrix: Any, *parts: np.ndarray) -> Any:
-    """The rows of several parts, one after another, brought to where they belong; what is in none is zero."""
-    count = len(matrix)
-    at = np.concatenate(parts)
+def _rows_of(matrix: Any, at: np.ndarray) -> Any:
+    """The rows ``at`` of a matrix; those that follow one another by a slice, which is many times faster."""
+    if len(at) and at[-1] - at[0] == len(at) - 1:
+        return matrix[int(at[0]) : int(at[-1]) + 1]
+    return matrix[at]
+
+
+def _joined(upper: Any, lower: Any, first: np.ndarray, second: np.ndarray, count: int) -> Any:
+    """The rows of two matrices brought to where they belong among ``count``; what is in neither is zero."""
+    both = jnp.concatenate([upper, lower, jnp.zeros((count - len(upper) - len(lower), upper.shape[1]), upper.dtype)])
+    at = np.concatenate([first, second])
     behind = np.argsort(np.concatenate([at, np.setdiff1d(np.arange(count), at)]))
-    return matrix if (np.diff(behind) == 1).all() else matrix[behind]
+    return both if (np.diff(behind) == 1).all() else both[behind]
 
 
 def _row_lengths(matrix: Any, xp: Any) -> Any:
@@ -187,7 +231,8 @@ def unconstrained(scheme: Scheme) -> tuple[Scheme, Elimination]:
     """The scheme of a plain polynomial fit of the same order, and what stands for the recursion that it has not."""
     rec = replace(scheme.rec, degrees=(-1,) * len(scheme.rec.degrees), depth=0)
     white = _whitening(rec)
-    made = Elimination(white, np.zeros((len(white), 0)), np.zeros(0), np.zeros((rec.fields, len(white))))
+    nothing = np.zeros((len(white), 0)), np.zeros(0), np.zeros((rec.fields, len(white)))
+    made = Elimination(white, *nothing, np.ones(rec.fields))
     return replace(scheme, rec=rec, sourced=False, flat=False, lost=0), made
 
 
@@ -209,11 +254,11 @@ def _eliminated_once(
 
 def _eliminated(scheme: Scheme, jac: np.ndarray, length: float) -> Elimination:
     rec = scheme.rec
-    matrix, lift = constraints(rec, jac, length, np)
+    matrix, lift, units = constraints(rec, jac, length, np)
     rows = matrix[np.array(rec.equation_rows)]
     white = _whitening(rec)
     if scheme.method == "SSPH":
-        return Elimination(white, np.zeros((white.shape[0], len(matrix))), lift, rows)
+        return Elimination(white, np.zeros((white.shape[0], len(matrix))), lift, rows, units)
     low, _, first, _ = fit_and_tail(rec)
     fitted = matrix[np.ix_(first, low)] if rec.depth else matrix
     if scheme.method == "S":
@@ -226,7 +271,7 @@ def _eliminated(scheme: Scheme, jac: np.ndarray, length: float) -> Elimination:
         basis[dependent] = -particular[dependent] @ fitted[:, free]
     if rec.depth:
         basis, particular = _deepened_on_host(scheme, matrix, basis, particular)
-    return Elimination(basis, particular, lift, rows)
+    return Elimination(basis, particular, lift, rows, units)
 
 
 def _deepened_on_host(

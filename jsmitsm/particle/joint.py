@@ -18,7 +18,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.linalg import block_diag
 
 from jsmitsm.particle import batches, moments
 from jsmitsm.particle.elimination import Elimination, Scheme, eliminate
@@ -72,6 +71,7 @@ class _Joint(NamedTuple):
     lifts: Any  # of all sides' sources
     length: Any
     root: tuple[Any, ...]  # of the conductivities
+    balance: tuple[Any, ...]  # what the values of each side's fields are multiplied with
 
 
 def _in_size_class(function: Any) -> Any:
@@ -141,6 +141,8 @@ def _each(sides: tuple[Side, ...]) -> Any:
 
 
 def _joint(scheme: JointScheme, points: Any, sides: tuple[Side, ...], each: Any, coef: Any) -> _Joint:
+    from jax.scipy.linalg import block_diag  # takes a hundredth of a second, which only regions need
+
     near = [
         moments.support(at, ids, neighbours, None, s.decay)
         for s, at, (ids, neighbours, *_) in zip(scheme.sides, points, each)
@@ -149,17 +151,19 @@ def _joint(scheme: JointScheme, points: Any, sides: tuple[Side, ...], each: Any,
     near = [moments.at_length(n, length) for n in near]
     root = _roots(scheme, coef)
     made = [_solved(s, side, e[2], length) for s, side, e in zip(scheme.sides, sides, each)]
-    rows, scale = _conditions(scheme, coef, [e[3] for e in each], length, root)
+    rows, scale = _conditions(scheme, coef, [e[3] for e in each], length, root, made)
     basis = block_diag(*(m.basis for m in made))
-    particular = block_diag(*(r * m.particular for r, m in zip(root, made)))
+    particular = block_diag(*(r * (m.particular @ jnp.eye(len(m.lift))) for r, m in zip(root, made)))
     z, solve = null_space(rows @ basis)
     reduced = basis @ z
     values = block_diag(*(_values(s, n) for s, n in zip(scheme.sides, near)))
-    data_scale = [jnp.tile(r * _powers(s, length), len(n.weight)) for r, s, n in zip(root, scheme.sides, near)]
+    data_scale = [jnp.tile(r * moments.balance(s.rec, length, m), len(n.weight))
+                  for r, s, n, m in zip(root, scheme.sides, near, made)]  # fmt: skip
     weight = jnp.concatenate([jnp.repeat(n.weight.at[0].set(0.0), s.rec.fields) for s, n in zip(scheme.sides, near)])
     return _Joint(
         basis, particular, reduced, rows, scale, solve, values, values @ reduced, weight, jnp.concatenate(data_scale),
         jnp.concatenate([m.lift for m in made]), length, tuple(root),
+        tuple(moments.balance(s.rec, length, m) for s, m in zip(scheme.sides, made)),
     )  # fmt: skip
 
 
@@ -179,7 +183,9 @@ def _solved(scheme: Scheme, side: Side, jac: Any, length: Any) -> Elimination:
     return side.shared._replace(lift=side.shared.lift * row_lifts(scheme.rec, length))
 
 
-def _conditions(scheme: JointScheme, coef: Any, owns: list[Any], length: Any, root: list[Any]) -> tuple[Any, Any]:
+def _conditions(
+    scheme: JointScheme, coef: Any, owns: list[Any], length: Any, root: list[Any], made: list[Elimination]
+) -> tuple[Any, Any]:
     """All conditions as rows over V, of unit size, and what their values are multiplied with."""
     sizes = [s.rec.fields * s.rec.size for s in scheme.sides]
     starts = np.concatenate([[0], np.cumsum(sizes)])
@@ -187,7 +193,7 @@ def _conditions(scheme: JointScheme, coef: Any, owns: list[Any], length: Any, ro
     terms = []
     for c, (k, (f, b)) in enumerate(scheme.slots):
         rec = scheme.sides[k].rec
-        term = coef[:, c] * factorial(b) * length ** (-sum(b) - rec.weights[f]) / root[k]
+        term = coef[:, c] * factorial(b) * length ** (-sum(b) - rec.weights[f]) * made[k].units[f] / root[k]
         between = between.at[:, int(starts[k]) + f * rec.size + index_of(rec.dim, rec.reach)[b]].add(term)
         terms.append(jnp.abs(term))
     size = jnp.max(jnp.stack(terms), axis=0)
@@ -196,8 +202,8 @@ def _conditions(scheme: JointScheme, coef: Any, owns: list[Any], length: Any, ro
     for k, (s, own) in enumerate(zip(scheme.sides, owns)):
         if s.n_own:
             at = jnp.zeros(s.rec.size, coef.dtype).at[0].set(1.0)
-            made, scale = functionals(s.own, own, at, s.rec, length)
-            rows.append(jnp.pad(made, ((0, 0), (int(starts[k]), int(starts[-1] - starts[k + 1])))))
+            mine, scale = functionals(s.own, own, at, s.rec, length, made[k].units)
+            rows.append(jnp.pad(mine, ((0, 0), (int(starts[k]), int(starts[-1] - starts[k + 1])))))
             scales.append(scale * root[k])
     return jnp.concatenate(rows), jnp.concatenate(scales)
 
@@ -206,10 +212,6 @@ def _values(scheme: Scheme, near: Support) -> Any:
     """The neighbours' values as functionals of U, (ns F, F K)."""
     p, fields = monomials(near.offset, scheme.rec.reach), scheme.rec.fields
     return p if fields == 1 else jnp.einsum("gk,fh->gfhk", p, jnp.eye(fields)).reshape(len(p) * fields, -1)
-
-
-def _powers(scheme: Scheme, length: Any) -> Any:
-    return length ** jnp.asarray(scheme.rec.weights, length.dtype)
 
 
 def _targets(scheme: JointScheme) -> np.ndarray:
@@ -233,7 +235,7 @@ def _rows(scheme: JointScheme, joint: _Joint) -> tuple[Row, ...]:
     rest = wanted.T - joint.values.T @ w
     v_own = joint.solve.T @ (joint.basis.T @ rest)
     v = joint.particular.T @ rest - (joint.rows @ joint.particular).T @ v_own
-    powers = [root * _powers(s, joint.length) for s, root in zip(scheme.sides, joint.root)]
+    powers = [root * power for power, root in zip(joint.balance, joint.root)]
     lift = 1.0 / jnp.concatenate(powers)[:, None]
     weights = (w * joint.data_scale[:, None]).T * lift
     source, condition = (v * joint.lifts[:, None]).T * lift, (v_own * joint.scale[:, None]).T * lift
@@ -261,6 +263,6 @@ def _expanded(scheme: JointScheme, joint: _Joint, values: Any, source: Any, give
         rec = s.rec
         mine = scaled[start : start + rec.fields * rec.size].reshape(rec.fields, rec.size) / joint.root[k]
         degrees = np.array([float(sum(a)) for a in multi_indices(rec.dim, rec.reach)])
-        out.append(mine * joint.length ** (-degrees) / _powers(s, joint.length)[:, None])
+        out.append(mine * joint.length ** (-degrees) / joint.balance[k][:, None])
         start += rec.fields * rec.size
     return tuple(out)

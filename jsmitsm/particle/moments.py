@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jsmitsm.particle.elimination import Elimination, Scheme
+from jsmitsm.particle.elimination import Deep, Elimination, Scheme, transposed
 from jsmitsm.particle.kernels import EDGE, Kernel, fitted
 from jsmitsm.particle.polynomials import FEW, Combinations, functionals, monomials
 from jsmitsm.particle.recursion import Recursion, fit_and_tail
@@ -114,7 +114,7 @@ def local_system(
     ns, fields = len(near.offset), rec.fields
     weight = near.weight.at[0].set(0.0) if skip_self else near.weight
     plain = values is None and fields == 1 and not scheme.n_data
-    if plain and rec.size <= FEW:
+    if plain and rec.size <= FEW and not isinstance(solution.particular, Deep):
         values = Combinations(near.offset, rec.reach)
     else:
         p = monomials(near.offset, rec.reach)
@@ -123,7 +123,8 @@ def local_system(
     weights = jnp.repeat(weight, fields)
     data_scale = jnp.zeros((ns, 0))
     if scheme.n_data:
-        rows, data_scale = jax.vmap(lambda c, q: functionals(scheme.data, c, q, rec, near.length))(data, p)
+        made = partial(functionals, scheme.data, rec=rec, length=near.length, units=solution.units)
+        rows, data_scale = jax.vmap(made)(data, p)
         given = jnp.any(data != 0, axis=2)
         values = jnp.concatenate([values, rows.reshape(ns * scheme.n_data, -1)])
         weights = jnp.concatenate([weights, (given * weight[:, None]).reshape(-1)])
@@ -132,7 +133,7 @@ def local_system(
     own_solve = jnp.zeros((basis.shape[1], 0))
     if scheme.n_own and scheme.method != "SSPH":
         at = jnp.zeros(rec.size, basis.dtype).at[0].set(1.0)
-        own_rows, own_scale = functionals(scheme.own, own, at, rec, near.length)
+        own_rows, own_scale = functionals(scheme.own, own, at, rec, near.length, solution.units)
         z, own_solve = null_space(own_rows @ basis)
         basis = basis @ z
         tests = None if tests is None else tests @ z
@@ -150,6 +151,11 @@ def _data_of(scheme: Scheme, near: Support, values: Any, basis: Any, plain: bool
         values = Combinations(near.offset, scheme.rec.order) if plain and len(low) <= FEW else values[:, low]
         basis = basis[low]
     return values @ basis if isinstance(values, Combinations) else product(values, basis)
+
+
+def balance(rec: Recursion, length: Any, solution: Elimination) -> Any:
+    """What the values of the fields are multiplied with inside the fit, (F,)."""
+    return length ** jnp.asarray(rec.weights, length.dtype) / solution.units
 
 
 def moment_matrix(system: System) -> Any:
@@ -173,7 +179,9 @@ def functional(scheme: Scheme, near: Support, system: System, wanted: Any) -> tu
         return w, jnp.zeros((scheme.rec.n_rows, wanted.shape[0])), jnp.zeros((0, wanted.shape[0])), defect
     basis, particular = system.elimination.basis, system.elimination.particular
     v_own = system.own_solve.T @ _lacking(system, wanted, w, basis) if scheme.n_own else jnp.zeros((0, wanted.shape[0]))
-    v = _lacking(system, wanted, w, particular) - (system.own_rows @ particular).T @ v_own
+    v = _lacking(system, wanted, w, particular)
+    if scheme.n_own:
+        v = v - transposed(particular, system.own_rows.T @ v_own)
     return w, v, v_own, defect
 
 
@@ -181,7 +189,7 @@ def _lacking(system: System, wanted: Any, w: Any, matrix: Any) -> Any:
     """matrix^T (wanted^T - values^T w): what the data leave of each wanted functional of matrix's columns."""
     if isinstance(system.values, Combinations):
         return matrix.T @ wanted.T - (system.values @ matrix).T @ w
-    return matrix.T @ (wanted.T - system.values.T @ w)
+    return transposed(matrix, wanted.T - system.values.T @ w)
 
 
 def row(scheme: Scheme, near: Support, solution: Elimination, own: Any, data: Any, tests: Any) -> Row:
@@ -190,8 +198,8 @@ def row(scheme: Scheme, near: Support, solution: Elimination, own: Any, data: An
     w, v, v_own, lebesgue, defect, system = make(scheme, near, solution, own, data, tests)
     rec, ns = scheme.rec, near.weight.shape[0]
     fields = rec.fields
-    # Fields are balanced by powers of the length inside the fit; the global unknowns are not.
-    power = near.length ** jnp.asarray(rec.weights, near.length.dtype)
+    # Fields are balanced inside the fit; the global unknowns are not.
+    power = balance(rec, near.length, solution)
     lift = jnp.ones(fields) if scheme.method == "SSPH" else 1.0 / power
     values = w[: ns * fields].T.reshape(fields, ns, fields) * power * lift[:, None, None]
     extra = w[ns * fields :].T.reshape(fields, ns, scheme.n_data) * system.data_scale * lift[:, None, None]
@@ -227,7 +235,7 @@ def _collocated(scheme, near, solution, own, data, tests):
     v_own = jnp.zeros((0, rec.fields))
     if scheme.n_own:
         here = jnp.zeros(rec.size).at[0].set(1.0)
-        wanted, scale = functionals(scheme.own, own, here, rec, near.length)
+        wanted, scale = functionals(scheme.own, own, here, rec, near.length, solution.units)
         v, v_own = jnp.zeros_like(v), jnp.diag(scale)
     w, _, _, defect = functional(scheme, near, system, wanted)
     own_weight = jnp.abs(w[np.arange(rec.fields), np.arange(rec.fields)])
@@ -258,7 +266,7 @@ def block(scheme: Scheme, near: Support, solution: Elimination, own: Any, data: 
     misfit = jnp.diag(system.weight) - root[:, None] * (a @ solve_gram(a, gram_inverse(a), a.T)) * root
     # Physical data are scaled like the unknowns inside the fit.
     ns = near.weight.shape[0]
-    power = near.length ** jnp.asarray(scheme.rec.weights, near.length.dtype)
+    power = balance(scheme.rec, near.length, solution)
     scale = jnp.concatenate([jnp.tile(power, ns), system.data_scale.reshape(-1)])
     return Block(scale[:, None] * misfit * scale, scale[:, None] * (misfit @ (system.values @ part.T)))
 
@@ -285,7 +293,7 @@ def coefficients(
     collocated = scheme.method == "SSPH"
     system = local_system(scheme, near, solution, own, data, tests, skip_self=not collocated)
     ns = near.weight.shape[0]
-    power = near.length ** jnp.asarray(rec.weights, near.length.dtype)
+    power = balance(rec, near.length, solution)
     scaled = (values[: ns * fields].reshape(ns, fields) * power).reshape(-1)
     scaled = jnp.concatenate([scaled, values[ns * fields :] * system.data_scale.reshape(-1)])
     part = particular_part(scheme, solution, system, source, given)

@@ -44,13 +44,29 @@ def _monomials_jvp(order, primals, tangents):
 def _columns(offset: Any, order: int) -> list[Any]:
     """The monomials one by one, (1, ns) each: one product makes each from another."""
     dim = offset.shape[1]
-    axes, place = jax.lax.split(offset.T, [1] * dim), index_of(dim, order)
+    axes = jax.lax.split(offset.T, [1] * dim)
     columns = [jax.lax.full_like(axes[0], 1.0)]
-    for a in multi_indices(dim, order)[1:]:
-        axis = next(k for k, n in enumerate(a) if n)
-        lower = tuple(n - (k == axis) for k, n in enumerate(a))
-        columns.append(columns[place[lower]] * axes[axis])
+    for lower, axis in _steps(dim, order):
+        columns.append(columns[lower] * axes[axis])
     return columns
+
+
+@lru_cache(maxsize=64)
+def _steps(dim: int, order: int) -> tuple[tuple[int, int], ...]:
+    """Of every monomial but the first: the one before it, and the axis by which that is multiplied."""
+    place = index_of(dim, order)
+    axes = [next(k for k, n in enumerate(a) if n) for a in multi_indices(dim, order)[1:]]
+    lower = [tuple(n - (k == axis) for k, n in enumerate(a)) for a, axis in zip(multi_indices(dim, order)[1:], axes)]
+    return tuple((place[a], axis) for a, axis in zip(lower, axes))
+
+
+def monomials_on_host(offset: np.ndarray, order: int) -> np.ndarray:
+    """All monomials s^a with |a| <= order, in numpy: (D, M) to (K, M)."""
+    steps = _steps(len(offset), order)
+    out = np.ones((len(steps) + 1, offset.shape[1]))
+    for k, (lower, axis) in enumerate(steps):
+        np.multiply(out[lower], offset[axis], out=out[k + 1])
+    return out
 
 
 class Combinations(NamedTuple):
@@ -91,19 +107,23 @@ def derivative_table(dim: int, order: int, b: tuple[int, ...]) -> tuple[np.ndarr
     )
 
 
-def functionals(slots: Sequence[Slot], coef: Any, p: Any, rec: Recursion, length: Any) -> tuple[Any, Any]:
+def functionals(
+    slots: Sequence[Slot], coef: Any, p: Any, rec: Recursion, length: Any, units: Any
+) -> tuple[Any, Any]:
     """Rows (n, F K) of conditions sum_s coef[n, s] d^b u_f at a point with monomials p (K,).
 
-    Each row is scaled to be free of units and of unit size at the leading term; the second
+    units (F,): of the fields. Each row is scaled to be free of units and of unit size at the leading term; the second
     result holds the factors (n,) of the right-hand side.
     """
     rows = jnp.zeros((coef.shape[0], rec.fields * rec.size), p.dtype)
     for s, (f, b) in enumerate(slots):
         lower, factor = derivative_table(rec.dim, rec.reach, b)
-        row = p[lower] * factor * length ** (-sum(b) - rec.weights[f])
+        row = p[lower] * factor * units[f] * length ** (-sum(b) - rec.weights[f])
         rows = rows.at[:, f * rec.size : (f + 1) * rec.size].add(coef[:, s, None] * row)
-    sizes = jnp.stack([jnp.abs(coef[:, s]) * length ** (-sum(b) - rec.weights[f]) for s, (f, b) in enumerate(slots)])
-    size = jnp.max(sizes, axis=0)
+    sizes = [
+        jnp.abs(coef[:, s]) * units[f] * length ** (-sum(b) - rec.weights[f]) for s, (f, b) in enumerate(slots)
+    ]
+    size = jnp.max(jnp.stack(sizes), axis=0)
     scale = 1.0 / jnp.where(size > 0, size, 1.0)
     return rows * scale[:, None], scale
 

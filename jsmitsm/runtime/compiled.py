@@ -1,4 +1,4 @@
-"""Compiled programs, kept under what they compute."""
+"""Compiled programs, kept under what they compute; and small results, under what they are computed from."""
 
 from __future__ import annotations
 
@@ -13,24 +13,43 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
 from jsmitsm.runtime.jaxprs import derivative
 
-_KEPT = 256
-_programs: OrderedDict[Any, Any] = OrderedDict()
-_lock = threading.Lock()  # solves may run in several threads
+
+class Same:
+    """Equal only to itself; keeps the object, so that its identity is not given away."""
+
+    def __init__(self, value: Any):
+        self.value = value
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Same) and other.value is self.value
+
+    def __hash__(self) -> int:
+        return id(self.value)
 
 
-def kept(key: Any, make: Callable[[], Any]) -> Any:
-    """The program of this key, made when first asked for; the longest unused are dropped."""
-    with _lock:
-        found = _programs.get(key)
-        if found is not None:
-            _programs.move_to_end(key)
-            return found
-    made = make()
-    with _lock:
-        _programs[key] = made
-        if len(_programs) > _KEPT:
-            _programs.popitem(last=False)
-    return made
+class _Store:
+    """What was made under a key, the longest unused dropped."""
+
+    def __init__(self, most: int):
+        self.most, self.made, self.lock = most, OrderedDict[Any, Any](), threading.Lock()  # solves run in threads too
+
+    def __call__(self, key: Any, make: Callable[[], Any]) -> Any:
+        with self.lock:
+            found = self.made.get(key)
+            if found is not None:
+                self.made.move_to_end(key)
+                return found
+        made = make()
+        with self.lock:
+            self.made[key] = made
+            if len(self.made) > self.most:
+                self.made.popitem(last=False)
+        return made
+
+
+kept = _Store(256)  # programs
+_programs = kept.made
+remembered = _Store(64)  # results of at most a megabyte or so
 
 
 def at_hand(known: set[int], least: int, most: float, default: int) -> int:

@@ -13,6 +13,29 @@ import numpy as np
 
 # What a user's function may raise when it is called.
 IN_FUNCTIONS = (TypeError, ValueError, IndexError, AttributeError, ArithmeticError, RecursionError)
+# What a flag says, in words that no other one has, and where docs/symptoms.md explains it.
+SYMPTOMS = {
+    "of their range between neighbours": "roughness",
+    "The global system is nearly singular": "singular",
+    "Round-off may reach": "round-off",
+    "The part of the source": "source",
+    "The coefficients of the operator change": "coefficients",
+    "A coefficient of the highest derivatives jumps": "jumps",
+    "amplify their neighbours' errors": "weak",
+    "No function fits the equation": "misfit",
+    "times diffusion between neighbours": "convection",
+    "The operator has waves of": "waves",
+    "are known to": "rounded",
+    "Between the particles the equation is missed": "missed",
+    "The estimated error is": "estimate",
+    "No order reaches the tolerance": "tolerance",
+    "where regions meet": "meeting",
+    "The estimated error in time": "time",
+    "Between neighbouring particles convection": "drift",
+    "are not resolved, or spurious": "modes",
+    "shorter than four": "modes",
+    "far from self-adjoint": "self-adjoint",
+}
 _LONGEST = 200  # letters of a value that a message quotes
 
 
@@ -48,6 +71,19 @@ class SingularMatrix(SolveError):
     def __init__(self, message: str, unknowns: Any = ()) -> None:
         super().__init__(message)
         self.unknowns: tuple[int, ...] = tuple(int(i) for i in unknowns)
+
+
+def explained(flags: Iterable[str]) -> list[str]:
+    """Flags, each with the place in the documentation that says what helps.
+
+    >>> explained(["The operator has waves of 2.1 particles a length."])
+    ['The operator has waves of 2.1 particles a length. (docs: symptoms#waves)']
+    """
+    out = []
+    for flag in flags:
+        anchor = next((f"#{name}" for words, name in SYMPTOMS.items() if words in flag), "")
+        out.append(flag if "(docs: " in flag else f"{flag} (docs: symptoms{anchor})")
+    return out
 
 
 def some(index: Any, most: int = 6) -> str:

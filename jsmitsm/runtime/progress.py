@@ -5,7 +5,8 @@ pipes or under pytest. Off for a block with ``js.no_progress``, for a process wi
 environment variable ``TQDM_DISABLE=1``.
 
 There is one bar at a time: what opens a bar inside of another's becomes a stage that the outer one
-names, "solve, local fits 40%". A clock ticks beside it, also while one long call (a factorisation,
+names, "solve, local fits 40%", with the seconds that are left of it where it lasts, and "compiling (first call)" while
+that is what takes the time. A clock ticks beside it, also while one long call (a factorisation,
 a compilation) reports nothing.
 """
 
@@ -14,6 +15,7 @@ from __future__ import annotations
 import os
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -22,6 +24,9 @@ from typing import Any
 # Seconds before a bar appears: what is done by then needs none. Then between two ticks of its clock,
 # and the shortest time between two movements.
 DELAY, TICK, PAUSE = 1.5, 0.5, 0.1
+# A stage that has lasted so many seconds tells how many are left.
+LASTING = 2.0
+COMPILING = "compiling (first call)"
 
 
 class _Nothing:
@@ -68,9 +73,8 @@ class _Bar:
             self._bar.set_description_str(f"{self.what}, {text}" if text else self.what, refresh=False)
             self._bar.update(0)
 
-    def stage(self, what: str, total: int | None) -> _Stage | _Nothing:
-        # A bar that fills up tells enough.
-        return _NOTHING if self.total else _Stage(self, what, total)
+    def stage(self, what: str, total: int | None) -> Any:
+        return _Counted(self) if self.total else _Stage(self, what, total)
 
     def close(self) -> None:
         self._done.set()
@@ -83,6 +87,7 @@ class _Stage:
 
     def __init__(self, outer: Any, what: str, total: int | None):
         self.outer, self.what, self.total, self.done = outer, what, total, 0
+        self.start = time.monotonic()
         self.say("")
 
     def update(self, n: int = 1) -> None:
@@ -93,6 +98,8 @@ class _Stage:
 
     def say(self, text: str) -> None:
         at = f" {self.done / self.total:.0%}" if self.total else f" {self.done}" if self.done else ""
+        if self.total and 0 < self.done < self.total and (gone := time.monotonic() - self.start) > LASTING:
+            at += f", {gone * (self.total / self.done - 1):.0f} s left"
         self.outer.say(self.what + at + (f", {text}" if text else ""))
 
     def stage(self, what: str, total: int | None) -> _Stage:
@@ -100,6 +107,17 @@ class _Stage:
 
     def close(self) -> None:
         self.outer.say("")
+
+
+class _Counted(_Nothing):
+    """What goes on inside of a bar that fills up, which tells enough: only that something compiles is told."""
+
+    def __init__(self, outer: Any):
+        self.outer = outer
+
+    def say(self, text: str) -> None:
+        if text == COMPILING:
+            self.outer.note(text)
 
 
 _NOTHING = _Nothing()
@@ -146,6 +164,17 @@ def bar(what: str, total: int | None = None, wanted: bool = True) -> Iterator[An
     finally:
         _shown.reset(token)
         made.close()
+
+
+@contextmanager
+def first_call() -> Iterator[None]:
+    """While a program runs for the first time: the bar says that it is compiled."""
+    say = getattr(_shown.get(), "say", lambda text: None)
+    say(COMPILING)
+    try:
+        yield
+    finally:
+        say("")
 
 
 def watched() -> bool:

@@ -11,6 +11,8 @@ from typing import Any
 
 import jax
 
+from jsmitsm.runtime.progress import first_call
+
 
 def cores() -> int:
     """The cores this process may run on."""
@@ -38,7 +40,8 @@ def side_by_side(function: Callable[[Any], Any], items: Sequence[Any], program: 
     for k, item in enumerate(items):
         key = program(item)
         if key not in _ready:
-            made[k] = function(item)
+            with first_call():
+                made[k] = function(item)
             if len(_ready) >= _MOST:
                 _ready.clear()
             _ready.add(key)

@@ -17,7 +17,7 @@ from collections.abc import Callable, Sequence
 from contextvars import ContextVar
 from functools import lru_cache, wraps
 from inspect import signature
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -28,12 +28,17 @@ from jax.interpreters import ad, batching, mlir
 from jsmitsm.runtime import one_kernel
 from jsmitsm.runtime.collector import uncollected
 from jsmitsm.runtime.compiler_options import on_cpu
+from jsmitsm.runtime.size_classes import BLOCK
+from jsmitsm.runtime.threads import cores, side_by_side
 from jsmitsm.runtime.tracers import is_traced, recorded
 
 # Options as pairs; None: f runs as it stands, in numpy, and its derivatives are compiled with little effort.
 Options = tuple[tuple[str, Any], ...] | None
 _LITTLE: Any = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 1}
 _KEPT = 1024
+# Rows that are worth a core of their own.
+_WORTH = 1000
+COUNT, WEIGHTS = "how many of the rows are wanted", "rows that weigh others"
 
 
 _only_run: ContextVar[bool] = ContextVar("a program that is only run", default=False)
@@ -61,14 +66,17 @@ def _to_be_run(function: Callable[..., Any]) -> Callable[..., Any]:
 
 def called(
     function: Callable[..., Any], static: dict[str, Any], arguments: dict[str, Any], options: Options,
-    small: bool = False,
+    small: bool = False, rows: Any = None,
 ) -> Any:  # fmt: skip
     """``function(**static, **arguments)`` as one program; not for calls inside of a larger one.
 
-    ``small``: its arrays are so small that one kernel should do it all.
+    ``small``: its arrays are so small that one kernel should do it all. ``rows``: a tree like the arguments that says
+    which of them, ``True``, have a row for each row of every result and for nothing else: under a transformation the
+    cores share the rows. ``COUNT`` stands for the number of rows that are wanted.
     """
     leaves, tree = jax.tree.flatten(arguments)
-    program = _whole(function, tuple(static.items()), tree, options, small)
+    by_row = None if rows is None else tuple(jax.tree.leaves(rows))
+    program = _whole(function, tuple(static.items()), tree, options, small, by_row)
     if not is_traced(leaves):
         return program.run(*leaves)
     return jax.tree.unflatten(program.result(_avals(leaves)).tree, program_p.bind(*leaves, program=program))
@@ -97,12 +105,61 @@ def in_one_program(function: Callable[..., Any], static: tuple[str, ...] = ()) -
 picked = in_one_program(lambda values, index: values[index])
 
 
+class Share(NamedTuple):
+    """The arguments of one core, and how many rows they have; ``wanted`` of these belong to the whole."""
+
+    arguments: list[Any]
+    rows: int
+    wanted: int
+
+
+class Rows(NamedTuple):
+    """How the rows of a program's arguments are shared among the cores.
+
+    arguments: of each one whether it has such rows, or WEIGHTS where they weigh the others, or COUNT where it is their
+    number; summed: of each result whether the shares add up to it, as what is pulled back to an argument without rows;
+    the others are put together again.
+    """
+
+    arguments: tuple[bool | str, ...]
+    summed: tuple[bool, ...]
+
+    def shares(self, arguments: Sequence[Any]) -> list[Share] | None:
+        """Equal shares, the last one filled up by rows without weight; None where sharing does not pay."""
+        n = next(len(x) for x, flag in zip(arguments, self.arguments, strict=True) if flag is True)
+        size = -(-n // (cores() * BLOCK)) * BLOCK
+        if cores() < 2 or size < _WORTH or jax.default_backend() != "cpu":
+            return None
+        return [self._share(arguments, slice(start, start + size), n, size) for start in range(0, n, size)]
+
+    def _share(self, arguments: Sequence[Any], some: slice, n: int, size: int) -> Share:
+        wanted = min(size, n - some.start)
+        out = []
+        for x, flag in zip(arguments, self.arguments, strict=True):
+            if flag is True or flag == WEIGHTS:
+                x = np.asarray(x)[some]
+                if wanted < size:
+                    x = np.concatenate([x, np.repeat(x[:1] * (flag is True), size - wanted, axis=0)])
+            elif flag == COUNT:
+                x = np.clip(np.asarray(x) - np.asarray(some.start, x.dtype), 0, size).astype(x.dtype)
+            out.append(x)
+        return Share(out, size, wanted)
+
+    def together(self, parts: list[list[np.ndarray]], shares: list[Share]) -> list[np.ndarray]:
+        """The results of the whole."""
+        summed = self.summed or (False,) * len(parts[0])
+        cut = [[x if add else x[: share.wanted] for x, add in zip(part, summed)] for part, share in zip(parts, shares)]
+        return [sum(some) if add else np.concatenate(some) for some, add in zip(zip(*cut), summed)]
+
+
 class Program:
     """A function of arrays; ``base``: not a derivative of another one."""
 
     def __init__(
-        self, function: Callable[..., Any], name: str, options: Options, base: bool = False, small: bool = False
-    ):
+        self, function: Callable[..., Any], name: str, options: Options, base: bool = False, small: bool = False,
+        rows: Rows | None = None,
+    ):  # fmt: skip
+        self.rows = rows
         self.name, self.options, self.on_host, self.small = name, options, base and options is None, small
         self.function, self.trace = function, jax.jit(function).trace
         self.results: dict[Any, Result] = {}
@@ -187,11 +244,13 @@ def _with(values: Sequence[Any], places: Sequence[int], new: Sequence[Any]) -> l
 
 @lru_cache(maxsize=_KEPT)
 def _whole(
-    function: Callable[..., Any], static: tuple[tuple[str, Any], ...], tree: Any, options: Options, small: bool
-) -> Program:
+    function: Callable[..., Any], static: tuple[tuple[str, Any], ...], tree: Any, options: Options, small: bool,
+    by_row: tuple[bool | str, ...] | None = None,
+) -> Program:  # fmt: skip
     """A function of the leaves of its arguments."""
     call = lambda *leaves: function(**dict(static), **jax.tree.unflatten(tree, leaves))  # noqa: E731
-    return Program(call, function.__name__, options, base=True, small=small)
+    rows = None if by_row is None else Rows(by_row, ())
+    return Program(call, function.__name__, options, base=True, small=small, rows=rows)
 
 
 @lru_cache(maxsize=_KEPT)
@@ -208,7 +267,11 @@ def _moved(program: Program, active: tuple[int, ...], reached: tuple[int, ...]) 
 
         return jax.jvp(some, tuple(x[k] for k in active), slopes)[1]
 
-    return Program(moved, f"moved_{program.name}", program.options)
+    rows = None
+    if program.rows is not None and not program.rows.summed:
+        flags = program.rows.arguments
+        rows = Rows((*flags, *(flags[k] for k in active)), ())
+    return Program(moved, f"moved_{program.name}", program.options, rows=rows)
 
 
 @lru_cache(maxsize=_KEPT)
@@ -225,9 +288,20 @@ def _pulled(program: Program, linear: tuple[int, ...], avals: tuple[Any, ...], g
             out = jax.tree.leaves(program.part(*_with(full, linear, moving)))
             return tuple(out[k] for k in given)
 
-        return jax.linear_transpose(some, *avals)(cotangents)
+        here = avals if rows is None else [_of_length(a, len(cotangents[0]), s) for a, s in zip(avals, rows.summed)]
+        return jax.linear_transpose(some, *here)(cotangents)
 
-    return Program(pulled, f"pulled_{program.name}", program.options)
+    rows = None
+    if program.rows is not None and not program.rows.summed:
+        flags = program.rows.arguments
+        known = tuple(flag for k, flag in enumerate(flags) if k not in linear)
+        rows = Rows((*known, *(WEIGHTS for _ in given)), tuple(flags[k] is not True for k in linear))
+    return Program(pulled, f"pulled_{program.name}", program.options, rows=rows)
+
+
+def _of_length(aval: Any, rows: int, summed: bool) -> Any:
+    """What a share of so many rows has of an argument."""
+    return aval if summed else aval.update(shape=(rows, *aval.shape[1:]))
 
 
 @lru_cache(maxsize=_KEPT)
@@ -242,6 +316,12 @@ program_p.multiple_results = True
 
 
 def _impl(*arguments: Any, program: Program) -> list[Any]:
+    rows = program.rows
+    shared = None if rows is None else rows.shares(arguments)
+    if rows is not None and shared is not None:
+        one = lambda share: [np.asarray(x) for x in jax.tree.leaves(program.run(*share.arguments))]  # noqa: E731
+        parts = side_by_side(one, shared, lambda share: (program, share.rows))
+        return [jax.device_put(x) for x in rows.together(list(parts), shared)]
     out = jax.tree.leaves(program.run(*arguments))
     if program.on_host:
         avals = program.result(_avals(arguments)).avals

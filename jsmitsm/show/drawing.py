@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from functools import partial
 from typing import Any
 
 import jax
@@ -11,19 +10,15 @@ import numpy as np
 
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.cloud.neighbours import Stencils, within
-from jsmitsm.cloud.regions.region_cloud import RegionCloud
-from jsmitsm.cloud.triangulation import cut, refined, simplices
 from jsmitsm.particle.kernels import Kernel
 from jsmitsm.runtime.tracers import is_traced
+from jsmitsm.show.pieces import AXES, Piece, clipped, pieces
 from jsmitsm.solution.solution import Solution
 
 # Okabe and Ito's palette, without its yellow, which is too light for dots on white.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 MARKERS = "os^Dv<>P"
 GREY = "0.62"
-_NAMES = "xyz"
-# Contours are refined by the local polynomials until they have this many triangles.
-_FINE = 6000
 
 
 def pyplot() -> Any:
@@ -79,6 +74,14 @@ def panels(given: Any, count: int, size: tuple[float, float], rows: bool = False
     return pyplot().subplots(*shape, figsize=both, layout="constrained", squeeze=False, sharex=rows)[1].ravel()
 
 
+def rows_of(given: Any, count: int, wide: int, size: tuple[float, float]) -> np.ndarray:
+    """Axes (count, wide): the given ones, or those of a new figure."""
+    if given is not None:
+        return panels(given, count * wide, size).reshape(count, wide)
+    both = (size[0] * wide, size[1] * count)
+    return pyplot().subplots(count, wide, figsize=both, layout="constrained", squeeze=False)[1]
+
+
 def padded(points: np.ndarray, dim: int) -> np.ndarray:
     """Points of a line get a second coordinate to be drawn at."""
     return np.concatenate([points, np.zeros((len(points), 1))], axis=1) if dim == 1 else points
@@ -91,7 +94,7 @@ def dress(ax: Any, dim: int) -> None:
         ax.spines[["left", "right", "top"]].set_visible(False)
         return
     ax.set_aspect("equal")
-    labels(ax, *_NAMES[:2])
+    labels(ax, *AXES[:2])
     if dim == 3:
         ax.set_zlabel("z")
         ax.locator_params(nbins=5)  # more would run into one another in perspective
@@ -237,39 +240,60 @@ def maps(cloud: Cloud, numbers: np.ndarray, anywhere: Callable | None, at: Mappi
     if not np.isfinite(numbers).all():
         raise ValueError("sol: has values that are not finite, and did not converge; see sol.diagnose()")
 
-    pieces = [_pieces(cloud, numbers, anywhere, *where) for where in _places(cloud, at)]
+    shown = [pieces(cloud, numbers, anywhere, *where) for where in places(cloud, at)]
     if log:
-        low = floor(np.concatenate([z for some in pieces for *_, z in some]))
-        pieces = [[(xy, triangles, np.log10(np.maximum(z, low))) for xy, triangles, z in some] for some in pieces]
-    every = np.concatenate([z for some in pieces for *_, z in some])
-    lo, hi = float(every.min()), float(every.max())
-    if hi - lo <= 1e-12 * max(abs(lo), abs(hi), 1e-300):
-        lo, hi = lo - 0.5, hi + 0.5
-    bounds = MaxNLocator(levels + 1).tick_values(lo, hi)
-    # A level that rounding alone reaches would promise values that do not occur.
-    slack = 1e-2 * (hi - lo)
-    bounds = bounds[int(bounds[1] <= lo + slack) : len(bounds) - int(bounds[-2] >= hi - slack)]
+        low = floor(np.concatenate([one.values for some in shown for one in some]))
+        shown = [[one._replace(values=np.log10(np.maximum(one.values, low))) for one in some] for some in shown]
+    bounds = steps(np.concatenate([one.values for some in shown for one in some]), levels)
     many = cloud.dim == 3
     size = (3.6, 3.4) if many else page(np.asarray(cloud.points))
-    drawn = panels(given, len(pieces), size)
-    for ax, some, (axis, position) in zip(drawn, pieces, _places(cloud, at)):
-        for xy, triangles, z in some:
-            # Matplotlib leaves white what lies on the highest level.
-            z = np.clip(z, bounds[0], bounds[-1] - 1e-9 * (bounds[-1] - bounds[0]))
-            filled = ax.tricontourf(*xy.T, triangles, z, levels=bounds, cmap="cividis" if log else "viridis")
+    drawn = panels(given, len(shown), size)
+    for ax, some, (axis, position) in zip(drawn, shown, places(cloud, at)):
+        for one in some:
+            filled = painted(ax, one, bounds, "cividis" if log else "viridis")
         ax.set_aspect("equal")
-        names = [n for k, n in enumerate(_NAMES[: cloud.dim]) if k != axis]
+        names = [n for k, n in enumerate(AXES[: cloud.dim]) if k != axis]
         ax.set(xlabel=names[0], ylabel=names[1])
         if many:
-            ax.set_title(f"{_NAMES[axis]} = {position:.4g}", fontsize="medium")
+            ax.set_title(f"{AXES[axis]} = {position:.4g}", fontsize="medium")
     if colorbar:
         bar = plt.colorbar(filled, ax=list(drawn), label=label, shrink=0.85)
+        bar.locator = round_ticks()
+        bar.update_ticks()
         if log:
-            whole = bool(np.floor(hi) - np.ceil(lo) >= 1)
+            whole = bool(np.floor(bounds[-1]) - np.ceil(bounds[0]) >= 1)
             bar.ax.yaxis.set_major_locator(MaxNLocator(6, integer=whole))
             power = FuncFormatter(lambda k, _: f"$10^{{{k:.0f}}}$" if whole else f"{10**k:.2g}")
             bar.ax.yaxis.set_major_formatter(power)
     return drawn if many else drawn[0]
+
+
+def steps(values: np.ndarray, levels: int) -> np.ndarray:
+    """Levels of a picture: round numbers, and at the ends the smallest and the largest value there is."""
+    from matplotlib.ticker import MaxNLocator
+
+    lo, hi = float(values.min()), float(values.max())
+    if hi - lo <= 1e-12 * max(abs(lo), abs(hi), 1e-300):
+        lo, hi = lo - 0.5, hi + 0.5
+    between = MaxNLocator(levels + 1).tick_values(lo, hi)
+    slack = 1e-2 * (hi - lo)  # a band that rounding alone makes would promise values that do not occur
+    return np.concatenate([[lo], between[(between > lo + slack) & (between < hi - slack)], [hi]])
+
+
+def round_ticks() -> Any:
+    """Round numbers beside a colour bar, whatever it begins and ends with."""
+    from matplotlib.ticker import MaxNLocator
+
+    return MaxNLocator(7)
+
+
+def painted(ax: Any, piece: Piece, bounds: np.ndarray, cmap: str) -> Any:
+    """One piece in filled contours that end where the domain does."""
+    # Matplotlib leaves white what lies on the highest level.
+    z = np.clip(piece.values, bounds[0], bounds[-1] - 1e-9 * (bounds[-1] - bounds[0]))
+    filled = ax.tricontourf(*piece.places.T, piece.triangles, z, levels=bounds, cmap=cmap)
+    clipped(ax, filled, piece.outline)
+    return filled
 
 
 def page(points: np.ndarray) -> tuple[float, float]:
@@ -282,7 +306,7 @@ def page(points: np.ndarray) -> tuple[float, float]:
     return wide + 1.3, wide * ratio + 0.5
 
 
-def _places(cloud: Cloud, at: Mapping[str, float] | None) -> list[tuple[int, float]]:
+def places(cloud: Cloud, at: Mapping[str, float] | None) -> list[tuple[int, float]]:
     """Axis and position of every slice; a 2D cloud is its own only one."""
     if cloud.dim == 2:
         if at is not None:
@@ -293,49 +317,9 @@ def _places(cloud: Cloud, at: Mapping[str, float] | None) -> list[tuple[int, flo
         lo, hi = points.min(axis=0), points.max(axis=0)
         digits = 2 - int(np.floor(np.log10((hi - lo).max())))
         return [(k, float(np.round((lo[k] + hi[k]) / 2, digits)) + 0.0) for k in (2, 1, 0)]
-    if not isinstance(at, Mapping) or not at or set(at) - set(_NAMES):
+    if not isinstance(at, Mapping) or not at or set(at) - set(AXES):
         raise ValueError(f'at: {at!r} is not a dict of positions by axis, such as {{"x": 0.5, "z": 0.2}}')
     for name, position in at.items():
         if not isinstance(position, (int, float, np.number)):
             raise ValueError(f"at: expected a number for {name!r}, got {position!r}")
-    return [(_NAMES.index(name), float(position)) for name, position in at.items()]
-
-
-def _pieces(cloud: Cloud, numbers: np.ndarray, anywhere: Callable | None, axis: int, position: float) -> list[tuple]:
-    """What is drawn of one domain or slice: one piece, or one for each region, so that jumps stay sharp."""
-    if not isinstance(cloud, RegionCloud):
-        return [_piece(cloud, numbers, anywhere, axis, position)]
-    out = []
-    for name, ids in cloud.regions.items():
-        part, own = cloud.region(name), None if anywhere is None else partial(anywhere, region=name)
-        reach = np.asarray(part.points)[:, axis]
-        if axis < 0 or reach.min() < position < reach.max():
-            out.append(_piece(part, numbers[ids], own, axis, position))
-    return out or [_piece(cloud.region(next(iter(cloud.regions))), numbers, anywhere, axis, position)]
-
-
-def _piece(cloud: Cloud, numbers: np.ndarray, anywhere: Callable | None, axis: int, position: float) -> tuple:
-    """What is drawn of one 2D domain or one slice: places (P, 2), triangles (T, 3), values (P,)."""
-    points = np.asarray(cloud.points, dtype=float)
-    cells = simplices(cloud)
-    if axis < 0:
-        z = numbers
-    else:
-        cells, points, edges = cut(points, cells, axis, position)
-        if not len(cells):
-            raise ValueError(
-                f"at: the plane {_NAMES[axis]} = {position:g} does not meet the domain, "
-                f"which reaches from {cloud.points[:, axis].min():g} to {cloud.points[:, axis].max():g}"
-            )
-        a, b = np.asarray(cloud.points)[edges].transpose(1, 0, 2)
-        share = (points[:, axis] - a[:, axis]) / (b[:, axis] - a[:, axis])
-        z = numbers[edges[:, 0]] * (1 - share) + numbers[edges[:, 1]] * share
-    kept = [k for k in range(cloud.dim) if k != axis]
-    if anywhere is None:
-        return points[:, kept], cells, z
-    given = len(points)
-    while len(cells) < _FINE:
-        points, cells = refined(points, cells)
-    # The particles keep the values that were solved for, held ones among them.
-    fine = anywhere(points[given:] if axis < 0 else points)
-    return points[:, kept], cells, np.concatenate([z, fine]) if axis < 0 else fine
+    return [(AXES.index(name), float(position)) for name, position in at.items()]

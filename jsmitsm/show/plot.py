@@ -1,4 +1,4 @@
-"""Pictures of clouds, solutions, errors, sparsity, tuning and convergence.
+"""Pictures of clouds, solutions, vectors, errors, sparsity, tuning and convergence.
 
 They need matplotlib, ``pip install "jsmitsm[plot]"``, imported when the first of them is drawn.
 Every function takes ``ax`` and returns what it drew on, so that pictures can be composed: one axes, or an array of
@@ -8,7 +8,7 @@ colour-blind (Okabe-Ito for categories, viridis and cividis for numbers), catego
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -22,10 +22,12 @@ from jsmitsm.show import drawing
 from jsmitsm.show.drawing import COLOURS, GREY, MARKERS
 from jsmitsm.show.histories import adaptation, convergence, sparsity, tuning
 from jsmitsm.show.series import animate
+from jsmitsm.show.solid import solid
+from jsmitsm.show.vectors import deformed, names_of, principal, streamlines, vectors
 from jsmitsm.solution.solution import Solution
 
-__all__ = ["adaptation", "animate", "cloud", "convergence", "error", "estimate", "solution", "sparsity", "tuning",
-           "values"]  # fmt: skip
+__all__ = ["adaptation", "animate", "cloud", "convergence", "deformed", "error", "estimate", "fields", "principal",
+           "solid", "solution", "sparsity", "streamlines", "tuning", "values", "vectors"]  # fmt: skip
 
 
 def cloud(what: Cloud | Solution, *, normals: bool = False, support: int | None = None, kernel: Kernel | None = None,
@@ -163,6 +165,59 @@ def solution(sol: Solution, *, field: int = 0, exact: Any = None, at: Mapping[st
         ax.legend(frameon=False)
     drawing.labels(ax, "x", label)
     return ax
+
+
+def fields(sol: Solution, *, names: Sequence[str] | None = None, ax: Any = None, **options: Any) -> Any:
+    """Every field of a system, side by side.
+
+    Parameters
+    ----------
+    sol : Solution
+        Of a system.
+    names : sequence of str, optional
+        One for every field, written above; ``u[0]``, ``u[1]``, ... if not given.
+    ax : array of Axes, optional
+        As many as there are panels.
+    **options : optional
+        As in ``js.plot.solution``.
+
+    Returns
+    -------
+    array of Axes
+        One a field; in 3D a row of slices for each.
+
+    Raises
+    ------
+    ValueError
+        For another number of names or axes than there are fields.
+
+    Examples
+    --------
+    >>> import jax; jax.config.update("jax_enable_x64", True)
+    >>> import jax.numpy as jnp, jsmitsm as js
+    >>> pde = lambda u, x: jnp.stack([js.laplacian(u[0])(x) - u[1](x), js.laplacian(u[1])(x) - 1.0])
+    >>> ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(0.0)}
+    >>> beam = js.solve(js.Problem(pde, ends, fields=2), js.interval(0.0, 1.0, 9))
+    >>> axes = js.plot.fields(beam, names=["deflection", "moment"])
+    """
+    if not isinstance(sol, Solution):
+        raise ValueError(f"sol: expected a js.Solution, got {type(sol).__name__}; plain numbers are for js.plot.values")
+    sol.refuse_stacked()
+    count = 1 if np.ndim(sol.u) == 1 else sol.u.shape[1]
+    titles = names_of(names, count)
+    if sol.cloud.dim == 3:
+        slices = 3 if options.get("at") is None else len(options["at"])
+        axes = drawing.rows_of(ax, count, slices, (3.6, 3.4))
+    else:
+        width, height = drawing.page(np.asarray(sol.cloud.points)) if sol.cloud.dim == 2 else (4.6, 3.4)
+        axes = drawing.panels(ax, count, (width, height))
+    for k, (one, title) in enumerate(zip(axes, titles)):
+        solution(sol, field=k, ax=one, **options)
+        if sol.cloud.dim < 3:
+            one.set_title(title, fontsize="medium")
+        else:
+            one[0].set_title(f"{title}, {one[0].get_title()}", fontsize="medium")
+    return axes
 
 
 def _regions(cloud: Cloud) -> list[tuple[Cloud, dict[str, str]]]:

@@ -173,11 +173,13 @@ class Anywhere:
                 f"multi_index: expected {self.cloud.dim} non-negative orders with a sum of at most {self.order}, "
                 f"got {multi_index!r}"
             )
-        near, weight = nearest_particles(self.cloud, points, self.cloud.dim + 2 if blend else 1)
-        inside = in_domain(self.cloud, points, outside)
+        near, weight, first = nearest_particles(self.cloud, points, self.cloud.dim + 2 if blend else 1)
+        inside = in_domain(self.cloud, points, outside, first)
         values = evaluated(b, self._recipe.reach, self.cloud.points, self._taylor, points, near, weight)
-        values = values if inside is None else jnp.where(inside[:, None], values, jnp.nan)
-        return values[:, 0] if self._recipe.fields == 1 else values
+        xp = jnp if is_traced(values, inside) else np
+        values = values if inside is None else xp.where(inside[:, None], values, xp.nan)
+        values = values[:, 0] if self._recipe.fields == 1 else values
+        return jax.device_put(values) if xp is np else values
 
     def integral(self, group: str | None = None) -> jax.Array:
         """The integral of u over a boundary group, or without a name over the domain.

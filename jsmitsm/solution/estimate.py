@@ -15,6 +15,7 @@ from jsmitsm.discretization.health import LEBESGUE
 from jsmitsm.discretization.layout import Class, Discretization
 from jsmitsm.discretization.least_squares import misfit
 from jsmitsm.discretization.leave_one_out import matrix, right_side, with_held
+from jsmitsm.discretization.resolution.digits import room
 from jsmitsm.discretization.rows import all_rows
 from jsmitsm.particle.moments import Row
 from jsmitsm.runtime.progress import bar
@@ -150,7 +151,8 @@ def _higher(fit: Fit, low: Discretization) -> tuple[Discretization, Numbers]:
             "the host; ask for it outside the transform"
         )
     cloud = Cloud(np.asarray(host), low.cloud.groups, low.cloud.normals)
-    high = discretized(fit.problem, cloud, "S", order, depth=low.rec.depth)
+    depth = min(low.rec.depth, room(low.rec, order, low.traced, cloud, fit.problem.params))
+    high = discretized(fit.problem, cloud, "S", order, depth=depth)
     high.cloud = fit.cloud
     taylor = fit.taylor
     if taylor is not None:

@@ -23,7 +23,7 @@ from jsmitsm.equation.problem import Problem
 from jsmitsm.linear import linsolve
 from jsmitsm.particle.moments import Row
 from jsmitsm.runtime.errors import SolveError, some
-from jsmitsm.runtime.tracers import is_traced
+from jsmitsm.runtime.tracers import concrete, is_traced
 from jsmitsm.solution.balance import imbalance, unbalanced
 from jsmitsm.solution.flags import flags
 from jsmitsm.solution.memory import refuse_too_large
@@ -158,7 +158,9 @@ class Run:
         values = with_held(self.disc, nums, x)
         self.seconds["solve"] += time.perf_counter() - start
         if is_traced(values):
-            return values, jnp.isfinite(values).all() & good
+            known = concrete(values)
+            finite = jnp.isfinite(values) if known is None else np.isfinite(np.asarray(known))
+            return values, finite.all() & good
         self.nums, self.values = nums, values
         self._check_degenerate(nums, values)
         return values, bool(good and np.isfinite(values).all() and not self.failed)
@@ -241,23 +243,24 @@ class Run:
                 particles,
             )
             return np.full(n, np.nan), False
-        x = x if is_traced(x) else np.asarray(x)
-        self.extra = x[n:]
+        values, self.extra = (x[:n], x[n:]) if len(b) > n else (x, np.zeros(0))
         if is_traced(x):
-            return x[:n], self._solvable(data, r, c, b, x, points) if balanced else True
+            return values, self._solvable(data, r, c, b, x, points) if balanced else True
         if self.floating:
             system = linsolve.factor(data, r, c, len(b), points, self.solver, self._elliptic)
             self.imbalance = imbalance(lambda e: system.solve(e, transpose=True), x, b, n)
             if balanced:
                 self.check_balance()
-        return x[:n], True
+        return values, True
 
     def _solvable(self, data: Any, r: Any, c: Any, b: Any, x: Any, points: Any) -> Any:
         """Under a JAX transform, where nothing raises: whether the system is regular, and floating data balance."""
         n = int((~self.disc.held).sum())
-        largest = jnp.max(jnp.abs(b), initial=0.0)
-        most = GROWN * usual_condition(self.disc) * jnp.where(largest > 0, largest, 1.0)
-        good = jnp.max(jnp.abs(x), initial=0.0) <= most
+        known, xp = (concrete(b), concrete(x)), np
+        if any(v is None for v in known):  # else nothing but a derivative is traced, and this has none
+            known, xp = (b, x), jnp
+        largest, size = (xp.max(xp.abs(xp.asarray(v)), initial=0.0) for v in known)
+        good = size <= GROWN * usual_condition(self.disc) * xp.where(largest > 0, largest, 1.0)
         if self.floating:
             data, b, x = jax.lax.stop_gradient((data, b, x))
             turned = lambda e: jnp.stack([

@@ -10,8 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm.cloud.cloud import Cloud
+from jsmitsm.runtime import notebooks
 from jsmitsm.runtime.arrays import Array
-from jsmitsm.runtime.errors import SolveError
+from jsmitsm.runtime.errors import SolveError, explained
 from jsmitsm.runtime.tracers import frozen, is_traced, owned
 from jsmitsm.solution.anywhere import Anywhere
 from jsmitsm.solution.estimate import Correction, correction
@@ -158,6 +159,11 @@ class Solution(Anywhere):
         return error
 
     @property
+    def neighbours(self) -> np.ndarray:
+        """Every particle's stencil (N, w): itself and those that it sees, padded with -1; images count from N."""
+        return np.asarray(self._fit.neighbours)
+
+    @property
     def defects(self) -> bool:
         """Whether the estimate knows defects, and ``correction`` more than the size of the error."""
         return not hasattr(self._fit, "error_estimate")
@@ -214,7 +220,8 @@ class Solution(Anywhere):
         if self._found is None and self._report is not None:
             self._found = self._report.flags(self._estimated)
         large = f"The estimated error is {self._share:.0%} of the solution: refine the cloud, or change the order."
-        return [*(self._found or []), *self.stats.get("objections", []), *([] if self._share <= LARGE else [large])]
+        found = [*(self._found or []), *self.stats.get("objections", []), *([] if self._share <= LARGE else [large])]
+        return explained(found)
 
     def condition_numbers(self) -> tuple[np.ndarray, float]:
         """Condition numbers of every particle's moment matrix and of the global system.
@@ -290,6 +297,21 @@ class Solution(Anywhere):
         deep = f", depth={self.depth}" if self.depth else ""
         state = "" if is_traced(self.converged) else f", converged={bool(np.all(self.converged))}"
         return f"Solution(u: {shape}, method={self.method!r}, order={self.order}{deep}{state})"
+
+    def _repr_html_(self) -> str:
+        """What is known already: nothing is estimated for it."""
+        if is_traced(self._values) or np.ndim(self._values) != 2:
+            return repr(self)
+        s, values = self.stats, np.asarray(self.u).reshape(len(self.cloud), -1)
+        rows = [("particles", len(self.cloud)), ("method, order, depth", f"{self.method}, {self.order}, {self.depth}")]
+        rows += [("u" if values.shape[1] == 1 else f"u[{k}]", notebooks.span(v)) for k, v in enumerate(values.T)]
+        rows.append(("converged", f"{bool(np.all(self.converged))}, {self.iterations} iteration(s)"))
+        rows += [("estimated error", f"{self._share:.1e} of it")] if self._error is not None else []
+        rows += [("flags", " ".join(explained(self._found)) or "none")] if self._found is not None else []
+        rows += [("seconds", f"{s['seconds']['total']:.3g}")] if "total" in (s.get("seconds") or {}) else []
+        picture = notebooks.dots(np.asarray(self.cloud.points), np.abs(values[:, 0]) if np.iscomplexobj(values)
+                                 else values[:, 0], 0)  # fmt: skip
+        return notebooks.shown("Solution", rows, picture)
 
     def tree_flatten(self):
         return (self._values, self.cloud, self._fit, self._fitted, self.converged, self.iterations), self._recipe

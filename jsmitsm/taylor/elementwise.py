@@ -16,6 +16,7 @@ from jsmitsm.taylor.series import (
     Ring,
     add,
     align,
+    along_line,
     choose,
     circle,
     div,
@@ -128,10 +129,13 @@ def smooth(*names: str) -> Callable[[Rule], Rule]:
 
     def register(function: Rule) -> Rule:
         def apply(ring: Ring, eqn: Any, *vals: Array) -> Array:
-            if all(v.shape[0] == 1 for v in vals):
-                return plain_elementwise(eqn, list(vals))
             start = plain_elementwise(eqn, [v[:1] for v in vals])
-            return function(ring, start, *vals)
+            if all([v.shape[0] == 1 for v in vals]):
+                return start
+            straight = None
+            if len(vals) == 1:
+                straight = along_line(ring, vals[0], lambda line, x: function(line, start, x))
+            return function(ring, start, *vals) if straight is None else straight
 
         RULES.update(dict.fromkeys(names, apply))
         return function

@@ -81,6 +81,18 @@ def factorial(a: MultiIndex) -> int:
     return math.prod(math.factorial(k) for k in a)
 
 
+@cache
+def powers(dim: int, degree: int) -> tuple[np.ndarray, np.ndarray]:
+    """Every multi-index a (T, D) and |a|! / a! (T,): (s_1 + s_2 + ...)^k is the sum of these over all |a| = k.
+
+    >>> powers(2, 2)[1].tolist()
+    [1.0, 1.0, 1.0, 1.0, 2.0, 1.0]
+    """
+    every = multi_indices(dim, degree)
+    return np.array(every), np.array([math.factorial(sum(a)) / factorial(a) for a in every])
+
+
+@cache
 def count(dim: int, degree: int) -> int:
     """How many multi-indices have total degree at most ``degree``."""
     return math.comb(degree + dim, dim) if degree >= 0 else 0

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from jsmitsm.taylor.multi_indices import block_rows, count, degree_of_count, degrees, product_rows
+from jsmitsm.taylor.multi_indices import block_rows, count, degree_of_count, degrees, powers, product_rows
 from jsmitsm.taylor.pairing import pairing, product
 
 Array = Any
@@ -29,7 +29,10 @@ class Ring(NamedTuple):
 
 def on_host(*values: Array) -> bool:
     """Whether every array is a numpy array, so that numpy will do."""
-    return all(isinstance(v, np.ndarray) for v in values)
+    for v in values:
+        if not isinstance(v, np.ndarray):
+            return False
+    return True
 
 
 def xp_of(*values: Array) -> Any:
@@ -54,7 +57,7 @@ def pad_to(x: Array, terms: int) -> Array:
 
 def align(*values: Array) -> list[Array]:
     """Give scalars the rank of the arrays they are combined with."""
-    rank = max(v.ndim for v in values)
+    rank = max([v.ndim for v in values])
     return [v if v.ndim == rank else v.reshape(v.shape[0], *(1,) * (rank - 2), v.shape[-1]) for v in values]
 
 
@@ -106,10 +109,30 @@ def mul(ring: Ring, x: Array, y: Array) -> Array:
             return out
         shape = np.broadcast_shapes(x.shape[1:], y.shape[1:])
         out = np.zeros((count(ring.dim, degree), *shape), np.result_type(x, y))
-        for a, (n, places) in enumerate(product_rows(ring.dim, left, right, degree)):
-            if n and np.any(x[a]):
+        ours, theirs = _filled_rows(x), _filled_rows(y)
+        if len(ours) > len(theirs):
+            x, y, left, right, ours, theirs = y, x, right, left, theirs, ours
+        rows, sparse = product_rows(ring.dim, left, right, degree), 2 * len(theirs) < len(y)
+        for a in ours:
+            n, places = rows[a]
+            if n and sparse:
+                some = theirs[: np.searchsorted(theirs, n)]
+                at = some + places.start if isinstance(places, slice) else places[some]
+                out[at] += x[a] * y[some]
+            elif n:
                 out[places] += x[a] * y[:n]
     return out
+
+
+def _filled_rows(x: np.ndarray) -> np.ndarray:
+    """The coefficients that do not vanish: few of a function of one coordinate alone."""
+    flat = x.reshape(len(x), -1)
+    filled = flat[:, 0] != 0
+    if filled.all():
+        return np.arange(len(x))
+    for k in np.flatnonzero(~filled):
+        filled[k] = flat[k].any()
+    return np.flatnonzero(filled)
 
 
 def block(ring: Ring, x: Array, degree: int) -> Array:
@@ -127,6 +150,8 @@ def product_block(ring: Ring, x: Array, y: Array, degree: int, first: int = 1, w
     if not on_host(x, y):
         pairs = product(dim, left, right, degree, degree, first, weighted)
         return pairing(x[: count(dim, left)], y[: count(dim, right)], pairs)
+    if dim == 1 and left == 1 and first == 1:  # along a line: one term is left of the sum
+        return x[1:2] * y[degree - 1 : degree] if degree <= right + 1 else 0.0 * (x[1:2] * y[:1])
     shape = np.broadcast_shapes(x.shape[1:], y.shape[1:])
     out = np.zeros((count(dim, degree) - count(dim, degree - 1), *shape), np.result_type(x, y))
     for j in range(max(first, degree - right), left + 1):
@@ -282,6 +307,21 @@ def take(x: Array, places: Array) -> Array:
         return xp.take(flat[..., 0], places, axis=1)
     rows = xp.take_along_axis(flat, places.reshape(1, -1, places.shape[-1]), axis=1)
     return rows.reshape(x.shape[0], *places.shape)
+
+
+def along_line(ring: Ring, x: Array, function: Callable[[Ring, Array], Array]) -> Array | None:
+    """A function of a linear x = x0 + a . s, from its series in one variable: g_k (a . s)^k; None for other x."""
+    if ring.dim == 1 or ring.degree < 2 or x.shape[0] != 1 + ring.dim or not on_host(x):
+        return None
+    slope = x[1:, ..., :1]
+    if x.shape[-1] > 1 and not (x[1:] == slope).all():
+        return None
+    line = function(Ring(1, ring.degree), np.concatenate([x[:1], np.ones_like(x[:1])]))
+    degree = len(line) - 1
+    exponents, weights = powers(ring.dim, degree)
+    shape = (len(weights), ring.dim, *(1,) * (x.ndim - 1))
+    monomials = (slope ** exponents.reshape(shape)).prod(axis=1) * weights.reshape(-1, *(1,) * (x.ndim - 1))
+    return line[degrees(ring.dim, degree)] * monomials.astype(x.dtype)
 
 
 def full_series(ring: Ring, x: Array, batch: int) -> Array:

@@ -112,3 +112,16 @@ def test_stencils_of_one_piece_stay_as_they_are():
         plain = np.asarray(js.stencils(cloud, size=14).indices)
         kept = [set(a[a >= 0]) == set(b[b >= 0]) for a, b in zip(table, plain)]
         assert np.mean(kept) > 0.99
+
+
+def test_both_sides_of_a_slit_have_their_particles():
+    """The sides of a slit lie nearer to each other than half a spacing, with nothing of the domain between them."""
+    corners = [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0), (1.0, -0.01)]
+    cloud = js.from_polygon(corners, 0.12)
+    points = np.asarray(cloud.points)[cloud.groups["boundary"]]
+    inner = points[(points[:, 0] > 0.1) & (points[:, 0] < 0.9)]
+    assert (inner[:, 1] == 0.0).sum() == (np.abs(inner[:, 1] + 0.01 * inner[:, 0]) < 1e-12).sum() == 7
+    # At the open end two corners lie close together; each sees its own side of the domain.
+    problem = js.Problem(lambda u, x: js.laplacian(u)(x), {"boundary": js.dirichlet(lambda x: x[0] * x[1])})
+    right = np.prod(np.asarray(cloud.points), axis=1)
+    np.testing.assert_allclose(js.solve(problem, cloud, order=4).u, right, rtol=0, atol=1e-12)  # exact, to round-off

@@ -164,3 +164,18 @@ def test_a_compiled_solve_is_not_cut_up(monkeypatch):
     near = js.stencils(LINE, size=6)
     jax.jit(lambda c: js.solve(LINEAR, LINE, stencils=near, solver="dense").u * c)(2.0).block_until_ready()
     assert "local fits 27%" not in seen()
+
+
+def test_compiling_and_what_is_left_are_told(monkeypatch):
+    """A stage that lasts tells the rest by what is done; a program's first run tells that it is compiled."""
+    seen = watch(monkeypatch)
+    monkeypatch.setattr(progress, "LASTING", 0.0)
+    with progress.bar("solve"), progress.bar("rows", 4) as stage:
+        with progress.first_call():
+            pass
+        stage.start -= 10.0
+        stage.update(2)
+    assert "solve, rows 0%, compiling (first call)" in told(seen) and "solve, rows 50%, 10 s left" in told(seen)
+    with progress.bar("tune", 3) as outer, progress.bar("solve"), progress.first_call():
+        outer.update(1)
+    assert "tune" in told(seen)[-1] and progress.COMPILING in seen().rpartition("tune")[2]

@@ -41,11 +41,14 @@ def test_gradients_and_jit():
         pde = lambda u, x, k, g: k * js.laplacian(u)(x) - x[0]
         return js.solve(js.Problem(pde, ends, params=k, unknowns={"V": 0.3}, constraints=given), ROD, depth=0)
 
-    potential = lambda k, charge: rod(k, charge).unknowns["V"]
-    by_k, by_charge = jax.grad(potential, (0, 1))(2.0, 3.0)
+    def potential(k, charge):
+        sol = rod(k, charge)
+        return sol.unknowns["V"], sol.converged
+
+    graded = jax.jit(jax.value_and_grad(potential, (0, 1), has_aux=True))
+    (value, converged), (by_k, by_charge) = graded(2.0, 3.0)
+    assert bool(converged) and abs(value - (3 - 1 / 6)) < 1e-10
     assert abs(by_k - 1 / 12) < 1e-9 and abs(by_charge - 1.0) < 1e-9
-    sol = jax.jit(rod)(2.0, 3.0)
-    assert bool(sol.converged) and abs(sol.unknowns["V"] - (3 - 1 / 6)) < 1e-10
 
 
 def test_slopes_all_around_with_a_multiplier_and_a_mean():

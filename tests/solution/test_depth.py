@@ -117,6 +117,18 @@ def test_beside_a_kink_of_the_source_its_values_tell(order):
     assert deep * 4 < flat
 
 
+def test_a_series_that_diverges_beside_a_line_gives_way_to_values():
+    """sqrt(s) beyond a line s = 0: at s the series ends after a distance of s, and deep recursions made of it 1e10."""
+    along = jnp.array([0.8, 0.6])
+    beyond = lambda x: jnp.maximum(along @ x - 0.73, 0.0)
+    bent = lambda x: beyond(x) ** 2.5 / 3.75
+    held = {s: js.dirichlet(bent) for s in SIDES}
+    root = lambda x: jnp.where(beyond(x) > 0, jnp.sqrt(jnp.where(beyond(x) > 0, beyond(x), 1.0)), 0.0)
+    sol = js.solve(js.Problem(lambda u, x: js.laplacian(u)(x) - root(x), held), SQUARE, order=4)
+    right = np.asarray(jax.vmap(bent)(SQUARE.points))
+    assert np.abs(sol.u - right).max() < 3e-3 * np.abs(right).max()
+
+
 def test_a_kink_outside_of_the_domain_changes_nothing():
     smooth, kinked = (lambda x: wave(x) + (x[0] + 1.0) ** 3 / 6.0), (lambda x: x[0] + 1.0)
     held = {s: js.dirichlet(smooth) for s in SIDES}

@@ -180,10 +180,16 @@ def thin(
     return np.flatnonzero(state == 1)
 
 
-def uncrowded(points: np.ndarray, h: np.ndarray, corners: int) -> np.ndarray:
+def uncrowded(points: np.ndarray, normals: np.ndarray, h: np.ndarray, corners: int) -> np.ndarray:
     """Indices without the boundary points closer than half a spacing to others across a sharp tip.
 
-    The first ``corners`` points always stay.
+    normals: outward. Points on both sides of a slit, with what is outside between them, stay, and so do the first
+    ``corners`` points.
     """
     order = np.concatenate([np.zeros(corners), np.ones(len(points) - corners)])
-    return np.union1d(thin(points, 0.5 * h, order), np.arange(corners))
+    a, b, gap = near_pairs(points, 0.5 * h)
+    step = points[b] - points[a]
+    apart = (normals[a] * normals[b]).sum(axis=1) < 0.0
+    apart &= ((step * normals[a]).sum(axis=1) > 0.0) & ((step * normals[b]).sum(axis=1) < 0.0)
+    pairs = a[~apart], b[~apart], gap[~apart]
+    return np.union1d(thin(points, 0.5 * h, order, pairs), np.arange(corners))

@@ -87,8 +87,9 @@ def regions(
     sketch = _shared(made, rule, seed)
     _meet(sketch)
     _check_gaps(sketch)
-    inside = _filled(sketch, seed, not callable(spacing))
-    return _put_together(sketch, inside, groups)
+    cloud = _put_together(sketch, _filled(sketch, seed, not callable(spacing)), groups)
+    cloud._shape = made
+    return cloud
 
 
 def _check_names(shapes: Any) -> None:
@@ -357,9 +358,8 @@ def _put_together(sketch: _Sketch, inside: dict[str, np.ndarray], groups: Any) -
     normals = np.full((start, dim), np.nan)
     interior = [ids[: len(inside[name])] for name, ids in members.items()]
     index: dict[str, Any] = {INTERIOR: np.concatenate(interior)}
-    named = {"boundary": np.arange(len(sketch.outer))}
-    if groups is not None:
-        named = grouped(sketch.points[sketch.outer], groups)
+    all_of_it = {"boundary": np.arange(len(sketch.outer))}
+    named = all_of_it if groups is None else grouped(sketch.points[sketch.outer], groups)
     free = np.ones(start, bool)
     for label, some in named.items():
         places, own = sketch.outer[some], []

@@ -110,6 +110,7 @@ class RegionCloud(Cloud):
         new = object.__new__(Cloud)
         new.points, new.groups, new.cell_groups = self.points[ids], Groups(groups), Groups({})
         new.normals, new._spacing = (self.normals * sign)[ids], None
+        new._shape = None if self._shape is None else self._shape[name]
         return new
 
     def replace(self, points: ArrayLike | None = None, normals: ArrayLike | None = None) -> Cloud:

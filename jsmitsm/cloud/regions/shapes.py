@@ -83,18 +83,18 @@ class Polygons:
     curved, piecewise = False, True
 
     def __init__(self, name: str, loops: list[np.ndarray], spacing: Spacing):
-        self._name, self._loops = name, loops
+        self._name, self.loops = name, loops
         points = np.concatenate(loops)
         self.lo, self.hi = points.min(axis=0), points.max(axis=0)
         self.distance = polygons.PolygonRegion(loops, spacing).distance
 
     def corners(self, spacing: Spacing) -> np.ndarray:
-        return np.concatenate([polygons.sharp_vertices(loop) for loop in self._loops])
+        return np.concatenate([polygons.sharp_vertices(loop) for loop in self.loops])
 
     def boundary(self, spacing: Spacing, seed: int, forced: np.ndarray) -> levelset.Boundary:
         parts = [
             polygons.edge_particles(*polygons.with_vertices(loop, forced), spacing=spacing, name=self._name)
-            for loop in self._loops
+            for loop in self.loops
         ]
         return levelset.Boundary(*(np.concatenate(arrays) for arrays in zip(*parts)))
 

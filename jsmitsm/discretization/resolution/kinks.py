@@ -12,8 +12,9 @@ from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.taylor.multi_indices import multi_indices
 
 # A quadratic fit takes the place of the series where its misfit is less than the first part of the series', and that is
-# more than the second times its last two degrees and more than the third of the source.
-BETTER, MISLED, FAINT = 0.5, 3.0, 1e-6
+# more than the second times its last two degrees and more than the third of the source; or where these last degrees are
+# the fourth times the source, beyond its radius of convergence.
+BETTER, MISLED, FAINT, DIVERGED = 0.5, 3.0, 1e-6, 3.0
 DEGREE = 2
 RIDGE = 1e-10
 
@@ -50,14 +51,18 @@ def _judged(disc: Discretization, cls: Class, equation: int, series: Any, values
     square = xp.sum(offset**2, axis=2)
     length = xp.sqrt(xp.max(square, axis=1))
     there = values[disc.images.owners(xp.where(valid, near, cls.ids[:, None]))]
+    valid = valid & xp.isfinite(there)  # a source may be infinite on the boundary
+    there = xp.where(valid, there, 0.0)
     degrees = np.array([sum(c) for c in multi_indices(dim, degree)])
     terms = [_monomial(offset, c) * f[:, None] for c, f in zip(multi_indices(dim, degree), series)]
     last = [t for t, k in zip(terms, degrees) if k > max(degree - 2, 0)]
-    count = xp.sum(valid, axis=1)
+    count = xp.maximum(xp.sum(valid, axis=1), 1)
     mean = lambda x: xp.sum(xp.where(valid, x, 0.0) ** 2, axis=1) / count
     misled, promised = mean(sum(terms) - there), mean(sum(last, xp.zeros(valid.shape)))
     fit, missed = _fitted(offset / length[:, None, None], valid, there, dim, xp)
-    switch = (missed < BETTER**2 * misled) & (misled > MISLED**2 * promised) & (misled > FAINT**2 * mean(there))
+    size = mean(there)
+    astray = (misled > MISLED**2 * promised) | (promised > DIVERGED**2 * size)
+    switch = (missed < BETTER**2 * misled) & astray & (misled > FAINT**2 * size)
     scaled = fit.T / length ** np.array([sum(c) for c in multi_indices(dim, DEGREE)])[:, None]
     kept = min(len(scaled), len(series))
     fitted = xp.concatenate([scaled[:kept], xp.zeros((len(series) - kept, len(cls.ids)))])

@@ -21,6 +21,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from jsmitsm.runtime.compiled import Same
 from jsmitsm.runtime.recall.lookups import Lookups, lookups
 from jsmitsm.runtime.recall.stateless import attribute, made_by_library, of_library, stateless
 
@@ -37,19 +38,6 @@ _SETTINGS = (
 
 class Unknown(Exception):
     """Something that cannot be known to be unchanged."""
-
-
-class _Same:
-    """Equal only to itself; keeps the object, so that its identity is not given away."""
-
-    def __init__(self, value: Any):
-        self.value = value
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Same) and other.value is self.value
-
-    def __hash__(self) -> int:
-        return id(self.value)
 
 
 def identity(function: Callable[..., Any]) -> Any:
@@ -71,7 +59,7 @@ def _value(value: Any, seen: dict[int, int]) -> Any:
     if isinstance(value, jax.Array | np.ndarray | np.generic):
         return _array(value)
     if stateless(value):
-        return _Same(value)
+        return Same(value)
     if id(value) in seen:
         return "again", seen[id(value)]
     seen[id(value)] = len(seen)
@@ -111,7 +99,7 @@ def _function(function: types.FunctionType, seen: dict[int, int]) -> Any:
     except ValueError:  # a cell that is still empty
         raise Unknown from None
     if made_by_library(function):
-        return code, tuple(_Same(v) if of_library(v) else _value(v, seen) for v in (*cells.values(), *defaults))
+        return code, tuple(Same(v) if of_library(v) else _value(v, seen) for v in (*cells.values(), *defaults))
     looks = lookups(code)
     if looks is None or function.__builtins__ is not vars(builtins):  # type: ignore[attr-defined]
         raise Unknown

@@ -15,7 +15,7 @@ import numpy as np
 _LIBRARIES = ("jax", "jaxlib", "numpy", "jsmitsm")
 # Rooms of this package whose functions a user's function may call, or that wrap it.
 _OWN = (
-    "jsmitsm.equation.field", "jsmitsm.equation.operators", "jsmitsm.equation.conditions", "jsmitsm.cloud.sdf",
+    "jsmitsm.equation.field", "jsmitsm.equation.operators", "jsmitsm.equation.closing", "jsmitsm.cloud.sdf",
     "jsmitsm.cloud.sdf.combine", "jsmitsm.cloud.sdf.vectors",
 )  # fmt: skip
 # Modules whose functions have no state, but for those named; numpy's are named one by one below.

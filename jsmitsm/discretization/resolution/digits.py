@@ -1,0 +1,64 @@
+"""How deep a recursion may go before round-off shows: degrees that cost more digits than they gain are left out."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from jsmitsm.cloud.cloud import Cloud
+from jsmitsm.equation.traced import Traced
+from jsmitsm.particle.recursion import Recursion
+from jsmitsm.runtime.tracers import concrete, is_traced
+
+# The highest degree of local polynomials where information travels, and where convection outweighs diffusion between
+# neighbours by the third number: measured, degree 12 leaves errors of 1e-5 there, and 1e-6 in their estimates. Beyond
+# the fourth two degrees have all of the gain.
+TRAVELLING, CARRIED, PECLET, STRONG = 10, 8, 5.0, 50.0
+# Particles whose coefficients are looked at.
+_LOOKED_AT = 64
+
+
+def room(rec: Recursion, order: int, traced: Traced, cloud: Cloud, params: Any) -> int:
+    """By how many degrees the recursion of a fit of this order may go deeper, at the most.
+
+    An equation whose leading terms say little of an axis, or little at all within a support, bounds the deep
+    coefficients weakly: what it says of the others is multiplied degree by degree.
+    """
+    if rec.fields > 1 or len(set(rec.orders)) > 1:
+        return CARRIED + TRAVELLING
+    if rec.orders[0] == 1 or lags(rec):
+        return max(TRAVELLING - order, 0)
+    peclet = _peclet(rec, traced, cloud, params)
+    if peclet <= PECLET:
+        return CARRIED + TRAVELLING
+    return min(max(CARRIED - order, 0), 2 if peclet > STRONG else CARRIED)
+
+
+def lags(rec: Recursion) -> bool:
+    """Whether an axis enters by lower derivatives only, as time does in a heat equation."""
+    along = np.array([b for _, b in rec.slots]).reshape(-1, rec.dim)
+    highest = along.max(axis=0, initial=0)
+    return bool(((highest > 0) & (highest < rec.orders[0]) & ~_mixed(rec, along)).any())
+
+
+def _mixed(rec: Recursion, along: np.ndarray) -> np.ndarray:
+    """Which axes (D,) take part in a leading term."""
+    return (along[along.sum(axis=1) == rec.orders[0]] > 0).any(axis=0)
+
+
+def _peclet(rec: Recursion, traced: Traced, cloud: Cloud, params: Any) -> float:
+    """Convection over diffusion between neighbours, the median over some particles; 0 where nothing is known of it."""
+    drift = [s for s, (_, b) in enumerate(rec.slots) if sum(b) == 1]
+    second = [s for s, (_, b) in enumerate(rec.slots) if sum(b) == 2]
+    points = concrete(cloud.points)
+    if rec.orders[0] != 2 or not (drift and second) or points is None or not traced.linear or is_traced(params):
+        return 0.0
+    points = np.asarray(points)
+    spacing = float((np.prod(np.ptp(points, axis=0)) / len(points)) ** (1.0 / rec.dim))
+    jac, _ = traced.coefficients(points[:: max(1, len(points) // _LOOKED_AT)], 0, params=params)
+    if is_traced(jac):
+        return 0.0
+    jac = np.asarray(jac)[0, :, 0]
+    speed, diffusion = np.linalg.norm(jac[drift], axis=0), np.abs(jac[second]).max(axis=0)
+    return float(np.median(speed * spacing / np.where(diffusion > 0, diffusion, np.inf)))
