@@ -1,6 +1,8 @@
 """Several processes, one problem: particles shared by bisection, rows as on one, solved under PETSc.
 
-Imports show and what stands before it. ``import jsmitsm.parallel as jp``; run as ``mpiexec -n 4 python script.py``.
+Imports show and what stands before it.
+
+``import jsmitsm.parallel as jp``; run as ``mpiexec -n 4 python script.py``.
 """
 
 from jsmitsm.parallel.distributed import ParallelCloud, read
