@@ -40,12 +40,14 @@ ROWS = [
         "tuning": (0.0, 1.38), "adaptation": (1.505, 1.38), "evolution": (3.01, 1.38), "modes": (4.515, 1.38),
         "show": (6.02, 1.38),
     },
+    {"parallel": (4.515, 2.885)},
 ]
 BESIDE = {"linear": (5.76, 1.64)}
 COLOURS = {
     "runtime": "#e6e6e6", "taylor": "#e6e6e6", "particle": "#cfe5f5", "cloud": "#cfe5f5", "equation": "#cfe5f5",
     "discretization": "#fbe3b5", "linear": "#cdebdf", "solution": "#f7d3c1", "tuning": "#f0dbe8",
     "adaptation": "#f0dbe8", "evolution": "#f0dbe8", "modes": "#f0dbe8", "show": "#f0dbe8",
+    "parallel": "#e4dcf0",
 }  # fmt: skip
 # What goes from one package to the next on the sheet, and where.
 ARROWS = {
@@ -63,6 +65,7 @@ ARROWS = {
     ("solution", "evolution"): (3.7, "states"),
     ("solution", "modes"): (5.2, "polynomials"),
     ("solution", "show"): (6.71, "values"),
+    ("show", "parallel"): (6.71, "meshes"),
 }
 # Sizes in points, and a line's height in inches.
 NAME, SAID, LISTED, LINE, PAD = 11, 8.2, 7.4, 0.15, 0.09

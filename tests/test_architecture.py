@@ -23,6 +23,7 @@ MAY_IMPORT = {
     "modes": ("runtime", "taylor", "particle", "cloud", "equation", "linear", "discretization", "solution"),
     "tuning": ("runtime", "taylor", "particle", "cloud", "equation", "linear", "discretization", "solution"),
     "show": ("runtime", "taylor", "particle", "cloud", "equation", "linear", "discretization", "solution"),
+    "parallel": ("runtime", "taylor", "particle", "cloud", "equation", "linear", "discretization", "solution", "show"),
 }
 
 

@@ -23,7 +23,7 @@ _TIE = 1e-7
 # So many ties, or half of a stencil, are looked for at the most; further ones are found by a search within the radius.
 _MOST_TIES = 4
 # Particles that tell how many ties there are, and (four times as many) whether the cloud is evenly spaced.
-_SAMPLE = 16
+_SAMPLE, EVEN_SAMPLE = 16, 64
 # The nearest neighbour is farther than this part of the spacing around 90 % of the particles of an even cloud: 0.57 on
 # a lattice jittered by 0.3 spacings, 0.67 and more on relaxed clouds, 0.36 on Halton's points, 0.18 on random ones.
 _EVEN = 0.5
@@ -190,12 +190,21 @@ def evenly_spaced(points: np.ndarray) -> bool:
 
     Judged by the distance of the nearest neighbour, in a sample, relative to the spacing around it.
     """
+    return is_even(kept_distances(points, _sampled(points, EVEN_SAMPLE)))
+
+
+def kept_distances(points: np.ndarray, centres: np.ndarray) -> np.ndarray:
+    """The distance of each centre's nearest particle (itself not counted) relative to the spacing around it."""
     count = min(3 ** points.shape[1], len(points) - 1)
-    distance, _ = _query(_searcher(points), _sampled(points, 4 * _SAMPLE), count + 1)
+    distance, _ = _query(_searcher(points), centres, count + 1)
     volume = {1: 2.0, 2: np.pi, 3: 4.0 * np.pi / 3.0}[points.shape[1]]
     spacing = distance[:, -1] * (volume / (count + 1)) ** (1.0 / points.shape[1])
-    relative = np.sort(distance[:, 1] / np.where(spacing > 0, spacing, 1.0))
-    return bool(relative[len(relative) // 10] > _EVEN)
+    return distance[:, 1] / np.where(spacing > 0, spacing, 1.0)
+
+
+def is_even(kept: np.ndarray) -> bool:
+    """Whether such distances of a sample are those of an even cloud."""
+    return bool(np.sort(kept)[len(kept) // 10] > _EVEN)
 
 
 def jumps(radius: np.ndarray, neighbours: np.ndarray) -> np.ndarray:

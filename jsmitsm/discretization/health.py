@@ -82,16 +82,30 @@ def repaired(
         elif not weak.all():
             new_classes.append(_some(cls, ~weak))
             new_rows.append(_take(row, ~weak))
-    for found in pieces.values():
+    sizes = _sizes(disc, pieces)
+    for key, found in pieces.items():
         poor = [(_some(cls, at), _take(row, at)) for cls, row, at in found if len(at)]
         if poor:
-            size = max(int((cls.neighbours >= 0).sum(axis=1).max()) for cls, *_ in found)
-            for cls, row, changed in _parted(disc, nums, *_repaired(disc, nums, poor, size), size):
+            for cls, row, changed in _parted(disc, nums, *_repaired(disc, nums, poor, sizes[key]), sizes[key]):
                 new_classes.append(cls)
                 new_rows.append(row)
                 touched.append(changed)
     after = examine(new_classes, new_rows)
     return new_classes, new_rows, replace(after, repaired=np.concatenate(touched))
+
+
+def _sizes(disc: Discretization, pieces: dict[Any, list[tuple[Class, Row, np.ndarray]]]) -> dict[Any, int]:
+    """The largest stencil of every kind of class that has weak ones; in a part of a cloud those of the whole."""
+    mine = {
+        key: max(int((cls.neighbours >= 0).sum(axis=1).max()) for cls, *_ in found)
+        for key, found in pieces.items()
+        if disc.part is not None or any(len(at) for *_, at in found)
+    }
+    if disc.part is None:
+        return mine
+    names = {key: (key[0].n_own, key[0].lost, key[1]) for key in mine}
+    largest = disc.part.largest({names[key]: size for key, size in mine.items()})
+    return {key: largest[name] for key, name in names.items()}
 
 
 def _parted(
@@ -120,18 +134,27 @@ def _repaired(
     near = np.concatenate([cls.neighbours for cls in classes])
     best = _Best(Row(*map(np.concatenate, zip(*rows))), near, bool(scheme.n_own))
     width = min(len(points), round(2.2 * size))
-    for attempt in (wider(1.5), wider(2.2), balanced(1.0), balanced(1.5), balanced(2.2)):
+    kept = {} if disc.walls is None else disc.walls.kept
+    for number, attempt in enumerate((wider(1.5), wider(2.2), balanced(1.0), balanced(1.5), balanced(2.2))):
         left = np.flatnonzero(best.lebesgue > LEBESGUE)
         if not len(left):
             break
         # One shape for all attempts: compiling costs far more than computing a few rows twice.
         left = np.resize(left, len(ids))
-        tried = attempt(points, ids[left], size, disc.walls)[:, :width]
+        question = number, size, ids[left].tobytes()
+        if question not in kept:
+            if len(kept) >= _KEPT:
+                kept.clear()
+            kept[question] = attempt(points, ids[left], size, disc.walls)[:, :width]
+        tried = kept[question]
         # And few shapes for all clouds.
         trial = Class(ids[left], _widened(tried, rounded_width(width, 16), 1, -1), scheme)
         best.update(left, trial.neighbours, class_rows(disc, nums, trial, shared))
     return Class(ids, best.neighbours, scheme, classes[0].wide), best.row, ids[best.changed]
 
+
+# So many attempts are kept with the walls of a cloud, for the next solve on it.
+_KEPT = 16
 
 # Moment matrices are looked at so many at a time, as many as one small program serves.
 _PIECE = 128

@@ -14,8 +14,8 @@ from jsmitsm.cloud.neighbours import Stencils
 from jsmitsm.cloud.regions.region_cloud import RegionCloud
 from jsmitsm.cloud.walls import Walls, seen
 from jsmitsm.discretization.periodic import Images, periodic_images, with_corners
-from jsmitsm.discretization.resolution.digits import room
-from jsmitsm.discretization.supports import check_supports, cut_off, default_kernel, find_stencils, walls_of
+from jsmitsm.discretization.resolution.digits import room, suited_depth
+from jsmitsm.discretization.supports import Part, check_supports, cut_off, default_kernel, find_stencils, walls_of
 from jsmitsm.equation.branches import FIELD
 from jsmitsm.equation.closing import closed
 from jsmitsm.equation.conditions import Group, group_conditions
@@ -84,6 +84,7 @@ class Discretization(Placed):
     # Where the equation degenerates, (N,): rows of the recursion that add nothing, conditions that it implies.
     lost: np.ndarray | None = None
     dropped: np.ndarray | None = None
+    part: Part | None = None  # of a cloud that several processes share
 
     @property
     def points(self) -> Any:
@@ -104,16 +105,18 @@ class Discretization(Placed):
     @property
     def active(self) -> np.ndarray:
         """The particles that carry equations, ascending."""
-        return np.flatnonzero(~self.held.all(axis=1))
+        free = ~self.held.all(axis=1)
+        return np.flatnonzero(free if self.part is None else free & self.part.own)
 
 
 def discretize(
     problem: Problem, cloud: Cloud, method: str, order: int, kernel: Kernel | None,
     stencils: Stencils | None, basis_terms: int | None, sources: bool = True, depth: int | str = "auto",
+    part: Part | None = None,
 ) -> Discretization:  # fmt: skip
     """Trace the problem, lay out its recursion and conditions, and find neighbours.
 
-    sources: whether the weights of the source are wanted even where it is zero.
+    sources: whether the weights of the source are wanted even where it is zero; part: where the cloud is a part.
     """
     if isinstance(cloud, RegionCloud) or isinstance(problem.pde, PerRegion):
         raise ValueError("problem: several regions are for js.solve, js.factorize, js.evolve, js.eigen; not for this")
@@ -128,9 +131,9 @@ def discretize(
     flat = traced.constant and rec.scale_free
     if depth == "auto":
         depth = suited_depth(method, rec, flat, sourced)
-        depth = depth and min(depth, room(rec, order, traced, cloud, problem.params))
+        depth = depth and min(depth, room(rec, order, traced, cloud, problem.params, part))
     rec = recursion(cloud.dim, order, problem.fields, traced.slots, traced.pattern, traced.order, int(depth))
-    groups = group_conditions(problem, with_corners(problem, cloud), order, traced.order)
+    groups = group_conditions(problem, with_corners(problem, cloud), order, traced.order, part is None)
     scheme = _scheme(method, rec, traced, problem, cloud, basis_terms)
     scheme = replace(scheme, **_conditions_layout(groups, rec), sourced=sourced, flat=flat)
     if scheme.n_data and method in ("I", "II", "III"):
@@ -149,12 +152,12 @@ def discretize(
             f"kernel: the derivatives of js.Constant vanish, and method {method} tests with them; use another kernel"
         )
     given_stencils = stencils is not None
-    place = _placed(problem, cloud, kernel, stencils, scheme, groups)
+    place = _placed(problem, cloud, kernel, stencils, scheme, groups, part)
     if kernel is None and method in ("I", "II"):
         kernel = default_kernel(cloud.points, np.arange(len(cloud)), place.stencils.indices)
     disc = Discretization(
         problem=problem, cloud=cloud, kernel=kernel, traced=traced, rec=rec, groups=groups, scheme=scheme,
-        given_stencils=given_stencils, basis_terms=basis_terms, **vars(place),
+        given_stencils=given_stencils, basis_terms=basis_terms, part=part, **vars(place),
     )  # fmt: skip
     if given_stencils or kernel is not None:
         check_supports(scheme, disc.stencils, kernel, disc.points, disc.n_own, disc.active)
@@ -169,7 +172,7 @@ def discretize(
 
 def _placed(
     problem: Problem, cloud: Cloud, kernel: Kernel | None, stencils: Stencils | None, scheme: Scheme,
-    groups: list[Group],
+    groups: list[Group], part: Part | None,
 ) -> Placed:  # fmt: skip
     """Who is held, who is whose neighbour: kept with the cloud, where all that decides is the same."""
     pairs = tuple(dict.fromkeys(c.groups for cs in problem.bcs.values() for c in cs if c.kind == "periodic"))
@@ -185,10 +188,10 @@ def _placed(
         held[partner != np.arange(len(cloud))] = True
         if len(images.owner) and scheme.method in ("I", "II"):
             raise ValueError(f"method: {scheme.method} does not follow periodic conditions; use S, III or SSPH")
-        walls, found = walls_of(problem, cloud, images), stencils
+        walls, found = walls_of(problem, cloud, images, part), stencils
         if found is None:
             conditioned = np.flatnonzero((n_own > 0) & ~held.all(axis=1))
-            found = find_stencils(cloud, kernel, scheme, images, conditioned, walls)
+            found = find_stencils(cloud, kernel, scheme, images, conditioned, walls, part)
         elif len(found) != len(cloud):
             raise ValueError(
                 f"stencils: built for {len(found)} particles, the cloud has {len(cloud)}; build them again"
@@ -206,21 +209,10 @@ def _placed(
     return cloud.kept((scheme, conditions, pairs, numbers), place)
 
 
-def suited_depth(method: str, rec: Recursion, flat: bool, sourced: bool) -> int:
-    """How many degrees the recursion should go beyond the fit.
-
-    Measured: two degrees have all of the gain where the solution is mild, four gain 2 to 10 times more where it
-    oscillates. I, II and III are the paper's. Where neither the operator nor a source has anything to say there, none.
-    """
-    if method != "S" or rec.order < 2 or (flat and not sourced):
-        return 0
-    if rec.order == 2 or (rec.dim == 3 and not flat):
-        return 2
-    return 4
-
-
 def mean_spacing(disc: Discretization) -> float:
     """The edge of the cube that each particle has for itself."""
+    if disc.part is not None:
+        return disc.part.spacing
     points = np.asarray(concrete(disc.cloud.points))
     return float((np.prod(np.ptp(points, axis=0)) / len(points)) ** (1.0 / disc.rec.dim))
 
@@ -258,7 +250,7 @@ def sorted_classes(disc: Discretization, ids: np.ndarray, stencils: Stencils) ->
         used = [near.shape[1]] * 2
     else:
         counts = np.max(np.where(near[ids] >= 0, np.arange(near.shape[1]), 0), axis=1, initial=0) + 1
-        narrow = int(np.sort(counts)[4 * (len(ids) - 1) // 5]) if len(ids) else 1
+        narrow = _most_need(counts, disc.part)
         wide = counts > 1.25 * narrow
         widest = int(counts[~wide].max(initial=1)), near.shape[1]
         used = [_width_at_hand(disc.scheme, rounded_width(width)) for width in widest]
@@ -269,6 +261,15 @@ def sorted_classes(disc: Discretization, ids: np.ndarray, stencils: Stencils) ->
         if len(some):
             classes += split(disc, Class(some, near[some][:, :width], disc.scheme, bool(k)))
     return classes
+
+
+def _most_need(counts: np.ndarray, part: Part | None) -> int:
+    """How many neighbours four fifths of all particles have at the most."""
+    if part is None:
+        return int(np.sort(counts)[4 * (len(counts) - 1) // 5]) if len(counts) else 1
+    widest = part.largest({"": int(counts.max(initial=1))})[""]
+    upto = np.cumsum(part.total(np.bincount(counts, minlength=widest + 1)))
+    return int(np.searchsorted(upto, 4 * (upto[-1] - 1) // 5, side="right"))
 
 
 def split(disc: Discretization, cls: Class) -> list[Class]:

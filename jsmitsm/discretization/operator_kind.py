@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from jsmitsm.discretization.coefficients import Numbers
@@ -37,14 +39,23 @@ def prefers_least_squares(disc: Discretization, nums: Numbers) -> bool:
             symbol[:, j, i] += jac[0, s, 0] / 2
     values = np.linalg.eigvalsh(symbol)
     diffusion = np.abs(values).max(axis=1)
-    if (values[:, 0] * values[:, -1] < -1e-10 * diffusion**2).any():
+    if _all_told(disc, (values[:, 0] * values[:, -1] < -1e-10 * diffusion**2).any()).any():
         return True
     drift = [s for s, (_, b) in enumerate(rec.slots) if sum(b) == 1]
     if not drift or concrete(disc.cloud.points) is None:
         return False
     speed = np.linalg.norm(jac[0, drift, 0], axis=0)
     convective = speed * mean_spacing(disc) / np.where(diffusion > 0, diffusion, np.inf)
-    return bool(np.median(convective) > 2.0)
+    if disc.part is None:
+        return bool(np.median(convective) > 2.0)
+    above, below = _all_told(disc, (convective > 2.0).sum(), (convective <= 2.0).sum())
+    return bool(above > below)
+
+
+def _all_told(disc: Discretization, *counts: Any) -> np.ndarray:
+    """Counts over the whole cloud."""
+    mine = np.array(counts, int)
+    return mine if disc.part is None else disc.part.total(mine)
 
 
 def _timelike(rec: Recursion) -> bool:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import jax.numpy as jnp
@@ -21,6 +23,23 @@ from jsmitsm.runtime.tracers import concrete, is_traced
 _EVEN_RATIO = {4: 1.5, 5: 1.5, 6: 1.5, 7: 1.65, 8: 1.65}
 # Particles whose given stencils are compared with their supports, at the most.
 _LOOKED_AT = 500
+
+
+@dataclass(frozen=True)
+class Part:
+    """A part of a cloud that several processes share: what is decided of the whole, and how they decide together.
+
+    own (n,) bool: the particles whose rows are made here, the others are only looked at. even: whether the whole cloud
+    is evenly spaced; spacing: the mean one of the whole; sample (m, D): some of its particles. largest: of numbers by
+    name the largest of all parts; total: the sum of an array over all parts; both are called by all of them at once.
+    """
+
+    own: np.ndarray
+    even: bool
+    spacing: float
+    sample: np.ndarray
+    largest: Callable[[dict[Any, int]], dict[Any, int]]
+    total: Callable[[np.ndarray], np.ndarray]
 
 
 def scheme_size(scheme: Scheme) -> int:
@@ -47,7 +66,7 @@ def default_size(scheme: Scheme, even: bool = False) -> int:
     return round(ratio * free) + 2
 
 
-def walls_of(problem: Problem, cloud: Cloud, images: Images) -> Walls | None:
+def walls_of(problem: Problem, cloud: Cloud, images: Images, part: Part | None = None) -> Walls | None:
     """The boundary as what hides particles from one another; None where nothing is known of it."""
     host, normals = concrete(cloud.points), concrete(cloud.normals)
     if host is None or (cloud.normals is not None and normals is None):
@@ -60,21 +79,23 @@ def walls_of(problem: Problem, cloud: Cloud, images: Images) -> Walls | None:
         wall[ids] = name != INTERIOR and name not in open_
     given = np.full((n, cloud.dim), np.nan) if normals is None else np.asarray(normals, float)
     ids = np.flatnonzero(images.extend_values(wall))
-    groups = {name: members[wall[members]] for name, members in cloud.groups.items() if name != INTERIOR}
+    judged = wall if part is None else wall & part.own
+    groups = {name: members[judged[members]] for name, members in cloud.groups.items() if name != INTERIOR}
     return Walls(points, ids, images.extend_values(given)[ids], images.extend_values(interior), groups)
 
 
 def find_stencils(
-    cloud: Cloud, kernel: Kernel | None, scheme: Scheme, images: Images, conditioned: np.ndarray, walls: Walls | None
-) -> Stencils:
+    cloud: Cloud, kernel: Kernel | None, scheme: Scheme, images: Images, conditioned: np.ndarray, walls: Walls | None,
+    part: Part | None = None,
+) -> Stencils:  # fmt: skip
     """Neighbours that each particle sees, see ``jsmitsm.cloud.walls``; outward normals are checked by the way."""
-    found = _found_stencils(cloud, kernel, scheme, images, conditioned, walls)
+    found = _found_stencils(cloud, kernel, scheme, images, conditioned, walls, part)
     if walls is not None and cloud.dim == 1:
         walls.check_outward(np.asarray(found.indices))
     if walls is not None and kernel is None:
         counts = (np.asarray(found.indices) >= 0).sum(axis=1)
         needed = scheme_size(scheme) + 1
-        few = np.flatnonzero(counts < min(needed, counts.max()))
+        few = np.flatnonzero((counts < min(needed, counts.max())) & (True if part is None else part.own))
         if len(few):
             raise ValueError(
                 f"cloud: {len(few)} particle(s), e.g. particle {few[0]}, see only {counts[few[0]]} of the {needed} "
@@ -85,8 +106,9 @@ def find_stencils(
 
 
 def _found_stencils(
-    cloud: Cloud, kernel: Kernel | None, scheme: Scheme, images: Images, conditioned: np.ndarray, walls: Walls | None
-) -> Stencils:
+    cloud: Cloud, kernel: Kernel | None, scheme: Scheme, images: Images, conditioned: np.ndarray, walls: Walls | None,
+    part: Part | None,
+) -> Stencils:  # fmt: skip
     """Neighbours from the kernel's support, or as many of the nearest as the method needs without a kernel.
 
     conditioned: the particles with conditions of their own, one-sided all of them.
@@ -109,7 +131,8 @@ def _found_stencils(
         if cloud.dim == 1:
             normals = None if len(images.owner) or walls is None else walls.all_normals()
             return in_line(points, min(default_size(scheme), len(points)), which, normals)
-        size = min(default_size(scheme, scheme.method == "S" and evenly_spaced(points)), len(points))
+        even = scheme.method == "S" and (evenly_spaced(points) if part is None else part.even)
+        size = min(default_size(scheme, even), len(points))
         found, full = nearest_seen(points, size, which, walls), min(default_size(scheme), len(points))
         if size == full:
             return found

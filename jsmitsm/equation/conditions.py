@@ -59,10 +59,14 @@ class Part:
     numbers: Callable[[Any], tuple[Any, Any]]
 
 
-def group_conditions(problem: Problem, cloud: Cloud, order: int, orders: tuple[int, ...]) -> list[Group]:
+def group_conditions(
+    problem: Problem, cloud: Cloud, order: int, orders: tuple[int, ...], whole: bool = True
+) -> list[Group]:
     """Check the conditions against the cloud and lay them out, one entry per boundary group.
 
-    orders: those of the operator's equations. Raises ValueError for missing, unknown or impossible conditions.
+    orders: those of the operator's equations; whole: not a part of a cloud, which may lack sides.
+
+    Raises ValueError for missing, unknown or impossible conditions.
     """
     highest = max(orders)
     names = [name for name in cloud.groups if name != INTERIOR]
@@ -87,7 +91,7 @@ def group_conditions(problem: Problem, cloud: Cloud, order: int, orders: tuple[i
             raise ValueError(
                 f"bcs[{name!r}]: its particles take the values of their periodic partners; remove its other conditions"
             )
-    if not any(c.kind != "free" for cs in given.values() for c in cs):
+    if whole and not any(c.kind != "free" for cs in given.values() for c in cs):
         raise ValueError(f"bcs: no condition on any group ({names}), so the solution is not determined; give one")
     groups = []
     counts = {name: 0 for name in names if name not in used and len(cloud.groups[name])}
@@ -102,12 +106,18 @@ def group_conditions(problem: Problem, cloud: Cloud, order: int, orders: tuple[i
         if rest:
             groups.append(_laid_out(problem, cloud, name, cloud.groups[name], rest, order, highest))
             counts[name] = len(groups[-1].held) + groups[-1].n_rows
-    _refuse_too_many(counts, sum(orders), problem.fields)
-    if problem.fields == 1 and not any(c.kind == "fix" for cs in given.values() for c in cs):
-        _refuse_too_few(counts, sum(orders))
+    if whole:
+        refuse_counts(problem, counts, sum(orders))
     groups = [g for g in groups if len(g.ids)]
     _refuse_held_twice(groups, problem.fields, len(cloud))
     return groups
+
+
+def refuse_counts(problem: Problem, counts: dict[str, int], total: int) -> None:
+    """More or fewer conditions on the sides (counts by name) than an operator of order ``total`` takes."""
+    _refuse_too_many(counts, total, problem.fields)
+    if problem.fields == 1 and not any(c.kind == "fix" for cs in problem.bcs.values() for c in cs):
+        _refuse_too_few(counts, total)
 
 
 def _refuse_too_many(counts: dict[str, int], total: int, fields: int) -> None:

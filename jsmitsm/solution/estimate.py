@@ -67,8 +67,8 @@ def correction(fit: Fit, values: Any) -> Correction:
     defect = _per_value(high, *high_rows, high_nums, values)
     own = _per_value(low, classes, rows, nums, values)
     free = np.flatnonzero(~low.held.reshape(-1))
-    ratio = _one_scale(own[1], defect[1], low)
-    trust = _trust(high, *high_rows)
+    ratio = one_scale(own[1], defect[1], low)
+    trust = trust_of(high, *high_rows)
     weighed = ratio * trust * defect[0]
     data, r, c = matrix(low, classes, rows)
     x, _ = run.solved(data, r, c, weighed.reshape(-1)[free], balanced=False)
@@ -85,9 +85,10 @@ def correction(fit: Fit, values: Any) -> Correction:
     return Correction(spread(x), weighed, adjoint)
 
 
-def _one_scale(mine: Any, theirs: Any, disc: Discretization) -> Any:
+def one_scale(mine: Any, theirs: Any, disc: Discretization, own: Any = True, median: Any = None) -> Any:
     """The ratios (N, F) of the weights that the source has in the rows of both orders, without outliers.
 
+    own (N,): the particles that have rows, and median: of the whole cloud's, where this is a part of one.
     A row with a condition of its own hardly hangs on the source, whose weights may vanish there in one of the two.
     """
     xp = jnp if is_traced(mine, theirs) else np
@@ -96,15 +97,15 @@ def _one_scale(mine: Any, theirs: Any, disc: Discretization) -> Any:
     typical = xp.ones(ratio.shape)
     for some in (disc.n_own == 0, disc.n_own > 0):
         for f in range(ratio.shape[1]):
-            ids = np.flatnonzero(some & ~disc.held[:, f])
-            if len(ids):
+            ids = np.flatnonzero(some & ~disc.held[:, f] & own)
+            if len(ids) or median is not None:
                 typical = xp.where((np.isin(np.arange(len(ratio)), ids))[:, None] & (np.arange(ratio.shape[1]) == f),
-                                   xp.median(ratio[ids, f]), typical)  # fmt: skip
+                                   (median or xp.median)(ratio[ids, f]), typical)  # fmt: skip
     part = ratio / typical
     return typical * xp.where(part > 0, xp.clip(part, 1.0 / OUTLIER, OUTLIER), 1.0)
 
 
-def _trust(disc: Discretization, classes: list[Class], rows: list[Row]) -> Any:
+def trust_of(disc: Discretization, classes: list[Class], rows: list[Row]) -> Any:
     """How far the rows of the higher order are trusted, (N, 1): those of one-sided stencils amplify what they miss."""
     traced = is_traced(rows)
     xp = jnp if traced else np
@@ -172,7 +173,7 @@ def _per_value(disc: Discretization, classes: Any, rows: Any, nums: Numbers, val
     au = xp.zeros(len(free)).at[r].add(data * u[c]) if traced else np.bincount(r, data * u[c], len(free))
     residual, weight = xp.zeros(disc.held.size), xp.ones(disc.held.size)
     first = np.array(disc.rec.equation_rows)
-    parts = [_strongest(xp.asarray(row.source)[:, :, first], xp) for row in rows]
+    parts = [strongest(xp.asarray(row.source)[:, :, first], xp) for row in rows]
     ids = np.concatenate([cls.ids for cls in classes])
     strength = xp.concatenate(parts)
     if traced:
@@ -184,7 +185,7 @@ def _per_value(disc: Discretization, classes: Any, rows: Any, nums: Numbers, val
     return residual.reshape(disc.held.shape), weight
 
 
-def _strongest(weights: Any, xp: Any) -> Any:
+def strongest(weights: Any, xp: Any) -> Any:
     """Of each row's weights of the sources (n, F, E), the largest in size: (n, F)."""
     place = xp.argmax(xp.abs(weights), axis=2)
     return xp.take_along_axis(weights, place[..., None], axis=2)[..., 0]

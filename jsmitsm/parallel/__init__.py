@@ -1,0 +1,16 @@
+"""Several processes, one problem: particles shared by bisection, rows as on one, solved under PETSc.
+
+Imports show and what stands before it. ``import jsmitsm.parallel as jp``; run as ``mpiexec -n 4 python script.py``.
+"""
+
+from jsmitsm.parallel.distributed import ParallelCloud, read
+from jsmitsm.parallel.estimate import error_estimate
+from jsmitsm.parallel.files import save
+from jsmitsm.parallel.gradient import value_and_grad
+from jsmitsm.parallel.solution import ParallelSolution, evaluate, norm
+from jsmitsm.parallel.solve import solve
+
+__all__ = [
+    "ParallelCloud", "ParallelSolution", "error_estimate", "evaluate", "norm", "read", "save", "solve",
+    "value_and_grad",
+]  # fmt: skip

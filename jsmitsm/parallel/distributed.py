@@ -1,0 +1,240 @@
+"""A cloud in slabs, a piece a process; and recursive bisection, which makes compact parts of them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from jsmitsm.cloud.cloud import INTERIOR, Cloud
+from jsmitsm.cloud.regions.region_cloud import RegionCloud
+from jsmitsm.parallel.team import Team, team
+from jsmitsm.show.files import from_mesh
+
+# Halvings of an interval until a cut stands between two numbers.
+_HALVINGS = 60
+
+
+@dataclass(frozen=True)
+class Slab:
+    """The particles that one process holds of a cloud of ``count``.
+
+    number (n,): in the whole cloud; points, normals (n, D), NaN in the interior; group (n,): the number of the name in
+    ``names``; place (n,): among the particles of that group, in the order of the whole cloud.
+    """
+
+    names: tuple[str, ...]
+    count: int
+    number: np.ndarray
+    points: np.ndarray
+    normals: np.ndarray
+    group: np.ndarray
+    place: np.ndarray
+    with_normals: bool
+    sizes: tuple[int, ...] = ()  # of the groups of the whole cloud
+
+    def __len__(self) -> int:
+        return len(self.number)
+
+    @property
+    def dim(self) -> int:
+        return self.points.shape[1]
+
+    def columns(self, at: Any) -> np.ndarray:
+        """Some particles as rows of numbers, to be sent."""
+        whole = np.stack([self.number, self.group, self.place], axis=1)[at]
+        return np.concatenate([whole.astype(float), self.points[at], self.normals[at]], axis=1)
+
+    def of_rows(self, rows: np.ndarray) -> Slab:
+        """The slab of such rows, by number."""
+        rows = rows[np.argsort(rows[:, 0], kind="stable")]
+        number, group, place = (rows[:, k].astype(int) for k in range(3))
+        points, normals = rows[:, 3 : 3 + self.dim], rows[:, 3 + self.dim :]
+        return Slab(self.names, self.count, number, points, normals, group, place, self.with_normals, self.sizes)
+
+    def cloud(self) -> Cloud:
+        """These particles as a cloud of their own, with all groups, empty ones too."""
+        groups = {name: np.flatnonzero(self.group == k) for k, name in enumerate(self.names)}
+        return Cloud(self.points, groups, self.normals if self.with_normals else None)
+
+
+class ParallelCloud:
+    """A cloud of which every process holds a slab: what ``jp.read`` returns and ``jp.solve`` takes.
+
+    ``len(cloud)`` counts the particles of all processes; ``points``, ``numbers`` are this process's own.
+    """
+
+    def __init__(self, slab: Slab):
+        self.slab = slab
+
+    def __len__(self) -> int:
+        return self.slab.count
+
+    @property
+    def dim(self) -> int:
+        """Number of space dimensions D."""
+        return self.slab.dim
+
+    @property
+    def points(self) -> np.ndarray:
+        """This process's particles (n, D)."""
+        return self.slab.points
+
+    @property
+    def numbers(self) -> np.ndarray:
+        """Their numbers (n,) in the whole cloud."""
+        return self.slab.number
+
+    def __repr__(self) -> str:
+        return f"ParallelCloud({len(self.slab)} of {self.slab.count} particles in {self.dim}D here)"
+
+
+def read(
+    points: str | os.PathLike[str], groups: Any = None, normals: Any = None, *, names: Mapping[str, int] | None = None,
+    tags: str | None = None,
+) -> ParallelCloud:  # fmt: skip
+    """A cloud from files, of which every process reads its own slab.
+
+    Parameters
+    ----------
+    points : path
+        ``.npy``: an array (N, D), which is mapped, so that no process reads more than its slab. Any other name: a
+        mesh, as ``js.files.from_mesh`` reads it; every process reads the whole of it, and keeps its slab.
+    groups : path
+        With ``.npy``: an integer array (N,) in another ``.npy``, the group of every particle.
+    normals : path, optional
+        With ``.npy``: an array (N, D) of unit outward normals, NaN in the interior.
+    names : mapping
+        With ``.npy``: the integer that stands for each group, ``"interior"`` among them.
+    tags : str, optional
+        With a mesh: as in ``js.files.from_mesh``.
+
+    Returns
+    -------
+    ParallelCloud
+        The slab of this process.
+
+    Raises
+    ------
+    ValueError
+        For arrays of other shapes, and groups without a name.
+
+    Examples
+    --------
+    ``cloud = jp.read("points.npy", "groups.npy", "normals.npy", names={"interior": 0, "wall": 1})``
+    """
+    us = team()
+    with us.phase():
+        if os.fspath(points).endswith(".npy"):
+            slab = _mapped(us, points, groups, normals, names)
+        else:
+            slab = slab_of(us, from_mesh(os.fspath(points), tags))
+    return ParallelCloud(_placed(us, slab))
+
+
+def _mapped(us: Team, points: Any, groups: Any, normals: Any, names: Any) -> Slab:
+    if groups is None or not isinstance(names, Mapping) or INTERIOR not in names:
+        raise ValueError(
+            'groups, names: an .npy of points needs another of integers, one a particle, and names={"interior": 0, ...}'
+        )
+    mapped = np.load(points, mmap_mode="r")
+    if mapped.ndim != 2 or mapped.shape[1] not in (2, 3):
+        raise ValueError(f"points: expected an array (N, 2) or (N, 3), got shape {mapped.shape}")
+    some = _own_slab(us, len(mapped))
+    codes = _part_of(groups, "groups", (len(mapped),), some)
+    known = np.array(list(names.values()))
+    which = np.argmax(codes[:, None] == known, axis=1)
+    stray = np.flatnonzero(known[which] != codes)
+    if len(stray):
+        raise ValueError(f"groups: particle {some.start + stray[0]} has {codes[stray[0]]}, which names does not name")
+    own = np.array(mapped[some], float)
+    given = np.full(own.shape, np.nan) if normals is None else _part_of(normals, "normals", mapped.shape, some)
+    number = np.arange(some.start, some.stop)
+    return Slab(tuple(names), len(mapped), number, own, np.array(given, float), which, np.zeros(len(own), int),
+                normals is not None)  # fmt: skip
+
+
+def _part_of(path: Any, name: str, shape: tuple[int, ...], some: slice) -> np.ndarray:
+    mapped = np.load(path, mmap_mode="r")
+    if mapped.shape != shape:
+        raise ValueError(f"{name}: expected an array {shape}, got shape {mapped.shape}")
+    return np.array(mapped[some])
+
+
+def _own_slab(us: Team, count: int) -> slice:
+    if count < us.size:
+        raise ValueError(f"cloud: {count} particles for {us.size} processes; start fewer")
+    return slice(us.rank * count // us.size, (us.rank + 1) * count // us.size)
+
+
+def _placed(us: Team, slab: Slab) -> Slab:
+    """With the place of every particle in its group."""
+    counts = np.stack(us.gather(np.bincount(slab.group, minlength=len(slab.names))))
+    before = counts[: us.rank].sum(axis=0)
+    place = np.zeros(len(slab), int)
+    for k in range(len(slab.names)):
+        at = np.flatnonzero(slab.group == k)
+        place[at] = before[k] + np.arange(len(at))
+    sizes = tuple(map(int, counts.sum(axis=0)))
+    return replace(slab, place=place, sizes=sizes)
+
+
+def slab_of(us: Team, cloud: Any) -> Slab:
+    """This process's slab of a cloud that every process has, or of one in slabs."""
+    if isinstance(cloud, ParallelCloud):
+        return cloud.slab
+    if not isinstance(cloud, Cloud):
+        raise ValueError(f"cloud: expected a js.Cloud or what jp.read returns, got {type(cloud).__name__}")
+    if isinstance(cloud, RegionCloud):
+        raise ValueError("cloud: several regions are not made for several processes; use js.solve")
+    some = _own_slab(us, len(cloud))
+    group, place = np.zeros(len(cloud), int), np.zeros(len(cloud), int)
+    for k, ids in enumerate(cloud.groups.values()):
+        group[ids], place[ids] = k, np.arange(len(ids))
+    points = np.asarray(cloud.points, float)
+    normals = np.full(points.shape, np.nan) if cloud.normals is None else np.asarray(cloud.normals, float)
+    number, sizes = np.arange(some.start, some.stop), tuple(map(len, cloud.groups.values()))
+    return Slab(tuple(cloud.groups), len(cloud), number, points[some], normals[some], group[some], place[some],
+                cloud.normals is not None, sizes)  # fmt: skip
+
+
+def bisected(us: Team, slab: Slab) -> Slab:
+    """The particles dealt anew, so that every process has those of a compact part, as many as the others."""
+    owner = np.zeros(len(slab), int)
+    boxes = [(0, us.size)]
+    while any(high - low > 1 for low, high in boxes):
+        owner, boxes = _halved(us, slab.points, owner, boxes)
+    parcels = [slab.columns(owner == rank) for rank in range(us.size)]
+    return slab.of_rows(np.concatenate(us.trade(parcels)))
+
+
+def _halved(us: Team, points: np.ndarray, owner: np.ndarray, boxes: list[tuple[int, int]]) -> Any:
+    """Every box of several processes cut across its longest side; owner (n,): the first process of a particle's box."""
+    split = [(low, high) for low, high in boxes if high - low > 1]
+    inside = [np.flatnonzero(owner == low) for low, _ in split]
+    ends = [[(x.min(axis=0), x.max(axis=0)) if len(x) else None for x in (points[ids] for ids in inside)]]
+    low_end, high_end, axis = [], [], []
+    every = us.gather(ends[0])
+    for k in range(len(split)):
+        known = [mine[k] for mine in every if mine[k] is not None]
+        low, high = np.min([x for x, _ in known], axis=0), np.max([x for _, x in known], axis=0)
+        axis.append(int(np.argmax(high - low)))
+        low_end.append(low[axis[-1]])
+        high_end.append(high[axis[-1]])
+    values = [points[ids, a] for ids, a in zip(inside, axis)]
+    share = np.array([((low + high) // 2 - low) / (high - low) for low, high in split])
+    wanted = share * us.total(np.array([len(ids) for ids in inside]))
+    a, b = np.array(low_end, float), np.array(high_end, float)
+    for _ in range(_HALVINGS):
+        middle = (a + b) / 2.0
+        below = us.total(np.array([(x < m).sum() for x, m in zip(values, middle)])) < wanted
+        a, b = np.where(below, middle, a), np.where(below, b, middle)
+    owner, new = owner.copy(), [box for box in boxes if box[1] - box[0] == 1]
+    for (low, high), ids, x, cut in zip(split, inside, values, (a + b) / 2.0):
+        middle = (low + high) // 2
+        owner[ids[x >= cut]] = middle
+        new += [(low, middle), (middle, high)]
+    return owner, new

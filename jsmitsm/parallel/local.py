@@ -1,0 +1,261 @@
+"""The part of a problem that one process discretises: its own particles in their halo, which is widened as needed.
+
+The rows are those that one process alone would make. What they need of the whole cloud (is it even, how many
+neighbours have most, how large are stencils that a repair widens) the processes decide together.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax
+import numpy as np
+
+from jsmitsm.cloud.neighbours import EVEN_SAMPLE, Stencils, is_even, kept_distances, nearest
+from jsmitsm.discretization.coefficients import Numbers, numbers
+from jsmitsm.discretization.layout import Class, discretize, sorted_classes, table
+from jsmitsm.discretization.operator_kind import prefers_least_squares
+from jsmitsm.discretization.resolution.digits import LOOKED_AT
+from jsmitsm.discretization.rows import all_coefficients
+from jsmitsm.discretization.supports import Part
+from jsmitsm.equation.bcs import Condition
+from jsmitsm.equation.conditions import refuse_counts
+from jsmitsm.equation.problem import Problem
+from jsmitsm.parallel.distributed import Slab
+from jsmitsm.parallel.halo import Halo, boxes_of
+from jsmitsm.parallel.team import Team
+from jsmitsm.particle.kernels import Kernel
+from jsmitsm.particle.moments import Row
+from jsmitsm.solution.run import Run
+
+# The first halo reaches so many times the radius of this many nearest particles for every free coefficient of the fit.
+# What repairs look at is ten stencils at the most.
+FIRST, POOL = 2.2, 10
+# A halo that falls short is widened to this more than what was missed.
+MORE = 1.05
+
+
+@dataclass
+class Settings:
+    """How a problem is discretised."""
+
+    method: str
+    order: int
+    depth: Any
+    kernel: Kernel | None
+    repair: bool
+    formulation: str
+
+
+class Local:
+    """One process's share: a halo, the discretisation on it, and the rows of the own particles."""
+
+    def __init__(self, team: Team, problem: Problem, mine: Slab, settings: Settings):
+        self.team, self.settings, self.mine = team, settings, mine
+        self.problem = problem
+        self.boxes = boxes_of(team, mine)
+        self._settle(team.most(_first_reach(mine, settings.order)))
+
+    def _settle(self, reach: float) -> None:
+        """Discretise on a halo of this reach, or of a larger one where the stencils need it."""
+        self.halo = Halo(self.team, self.mine, self.boxes, reach)
+        while (missing := self._made()) > 0.0:
+            self.halo = Halo(self.team, self.mine, self.boxes, MORE * (self.halo.reach + missing))
+
+    # -- what is static
+
+    def _made(self) -> float:
+        """Discretise on the present halo; by how much that falls short for some process."""
+        halo, s = self.halo, self.settings
+        with self.team.phase(halo.slab.number):
+            even = self._even()
+            self.part = Part(halo.own, even, self._spacing(), self._sample(), self.team.largest, self.team.total)
+            cloud = halo.slab.cloud()
+            kernel = s.kernel and local_kernel(s.kernel, halo.slab)
+            local = local_problem(self.problem, halo.slab)
+            self.cloud = cloud
+            self.disc = discretize(
+                local, cloud, s.method, s.order, kernel, None, None, sources=False, depth=s.depth, part=self.part
+            )
+        missing = self.team.most(self._stencils_miss())
+        if missing > 0.0 and self._grows():
+            return missing
+        with self.team.phase(halo.slab.number):
+            self._check_together()
+            self.run = Run(self.disc, self.disc.problem, "auto", True, s.repair, "loo")
+        return 0.0
+
+    def _grows(self) -> bool:
+        return self.team.total(int(len(self.halo) < self.mine.count)) > 0
+
+    def _even(self) -> bool:
+        """Whether the whole cloud is even, by the same sample as one process takes."""
+        slab, count = self.halo.slab, self.mine.count
+        sample = np.linspace(0, count - 1, min(count, EVEN_SAMPLE)).astype(int)
+        at = self.halo.ids[np.isin(slab.number[self.halo.ids], sample)]
+        kept = kept_distances(slab.points, slab.points[at]) if len(at) else np.zeros(0)
+        return is_even(np.concatenate(self.team.gather(kept)))
+
+    def _sample(self) -> np.ndarray:
+        """The particles by which one process judges the coefficients."""
+        step = max(1, self.mine.count // LOOKED_AT)
+        some = self.mine.number % step == 0
+        found = self.team.gather((self.mine.number[some], self.mine.points[some]))
+        number, points = (np.concatenate(parts) for parts in zip(*found))
+        return points[np.argsort(number)]
+
+    def _spacing(self) -> float:
+        low, high = np.min([a for a, _ in self.boxes], axis=0), np.max([b for _, b in self.boxes], axis=0)
+        return float((np.prod(high - low) / self.mine.count) ** (1.0 / self.mine.dim))
+
+    def _stencils_miss(self) -> float:
+        """By how much the halo falls short of the stencils of own particles, and of those that tell jumps from them."""
+        near, radius = np.asarray(self.disc.stencils.indices), self.disc.stencils.radius
+        ids = np.unique(near[self.halo.ids])
+        ids = ids[ids >= 0]
+        if radius is None:
+            return -1.0
+        return self.halo.short_by(np.broadcast_to(np.asarray(radius), len(near))[ids], ids)
+
+    def _check_together(self) -> None:
+        """What the conditions are as a whole: their counts, the same slots everywhere, and no field left floating."""
+        disc, team = self.disc, self.team
+        mine = {g.name: len(g.held) + g.n_rows for g in disc.groups}
+        free = {n: 0 for n, ids in disc.cloud.groups.items() if n != "interior" and len(ids) and n not in mine}
+        counts: dict[str, int] = {}
+        fixed = {n for n, cs in self.problem.bcs.items() if all(c.kind == "fix" for c in cs)}
+        for found in team.gather({**free, **mine}):
+            counts.update({n: max(k, counts.get(n, 0)) for n, k in found.items() if n not in fixed})
+        refuse_counts(self.problem, counts, sum(disc.rec.orders))
+        floating = set.intersection(*map(set, team.gather(disc.floating)))
+        if floating:
+            raise ValueError(
+                f"problem: nothing fixes the value of field(s) {sorted(floating)}, and solutions up to a constant are "
+                "not made for several processes; hold one value (js.fix), or use js.solve"
+            )
+        if len(set(team.gather((disc.scheme.free, disc.scheme.dependent)))) > 1:
+            raise ValueError(
+                "method: III eliminates other coefficients in other parts of this cloud, where the equation's leading "
+                'coefficients differ; use method="S"'
+            )
+
+    # -- rows
+
+    def numbers(self, taylor: Any = None) -> Numbers:
+        nums = numbers(self.disc, self.disc.problem, taylor)
+        if nums.degenerate is not None:
+            raise ValueError(
+                "pde: its highest derivatives lose their weight at some particles, and degenerate equations are not "
+                "made for several processes; use js.solve"
+            )
+        return nums
+
+    def rows(self, taylor: Any = None) -> tuple[Numbers, list[Class], list[Row]]:
+        """The numbers and the rows of the own particles; on a wider halo where a repair looked beyond the first."""
+        while True:
+            first = self.run.health is None
+            with self.team.phase(self.halo.slab.number):
+                nums = self.numbers(taylor)
+                if first and self.settings.formulation == "auto":
+                    self._refuse_least_squares(nums)
+                classes, rows = self.run.local_rows(nums)
+            missing = self.team.most(self._repairs_miss()) if first and self.settings.repair else 0.0
+            if missing <= 0.0 or not self._grows() or taylor is not None:
+                return nums, classes, rows
+            self._settle(MORE * (self.halo.reach + missing))
+
+    def _refuse_least_squares(self, nums: Numbers) -> None:
+        """Where information travels the least-squares form is right, of which the processes make none."""
+        if any(self.team.gather(prefers_least_squares(self.disc, nums))):
+            raise ValueError(
+                'formulation: in this equation information travels (first order, or convection above diffusion), and '
+                'the least-squares form is not made for several processes; say formulation="loo" where diffusion '
+                "does resolve it, or use js.solve"
+            )
+
+    def _repairs_miss(self) -> float:
+        """By how much the halo falls short of what the repair of weak stencils looks at."""
+        health = self.run.health
+        ids = np.unique(np.concatenate([health.repaired, health.weak])).astype(int) if health else np.zeros(0, int)
+        if not len(ids):
+            return -1.0
+        widest = max(int((c.neighbours >= 0).sum(axis=1).max()) for c in self.disc.classes)
+        count = POOL * widest
+        points = self.halo.slab.points
+        if len(points) < min(count, self.mine.count):
+            return self.halo.reach
+        radius = nearest(points, min(count, len(points)), ids).radius
+        return self.halo.short_by(np.asarray(radius), ids)
+
+    # -- local polynomials
+
+    def coefficients(self, values: np.ndarray, taylor: Any = None) -> np.ndarray:
+        """Taylor coefficients (n, F, K) of all local particles, the borrowed ones' from their owners."""
+        with self.team.phase(self.halo.slab.number):
+            near = Stencils(table(self.disc), None)
+            disc = replace(self.disc, classes=sorted_classes(self.disc, self.halo.ids, near), stencils=near)
+            nums = numbers(disc, disc.problem, taylor, everywhere=True)
+            found = np.asarray(all_coefficients(disc, nums, values))
+        return self.halo.spread(found)
+
+
+def _first_reach(mine: Slab, order: int) -> float:
+    """The reach of a first halo: that of a stencil, and of those next to it."""
+    size = {2: (order + 1) * 4, 3: (order + 1) ** 2 * 3}[mine.dim]
+    points = mine.points
+    sample = points[np.linspace(0, len(points) - 1, min(len(points), 400)).astype(int)]
+    from scipy.spatial import cKDTree
+
+    return FIRST * float(cKDTree(points).query(sample, k=min(size, len(points)))[0][:, -1].max())
+
+
+def local_kernel(kernel: Kernel, slab: Slab) -> Kernel:
+    """The kernel with the smoothing lengths of the local particles, where it has one for each."""
+    if np.ndim(kernel.h) == 0:
+        return kernel
+    if np.shape(kernel.h) != (slab.count,):
+        raise ValueError(f"kernel: h has shape {np.shape(kernel.h)}, expected a scalar or ({slab.count},)")
+    return kernel.at(slab.number)
+
+
+def local_problem(problem: Problem, slab: Slab) -> Problem:
+    """The problem with arrays over a group cut to its local particles, and held particles numbered here."""
+    bcs: dict[str, Any] = {}
+    for name, conditions in problem.bcs.items():
+        places, size = np.zeros(0, int), 0
+        if name in slab.names:
+            k = slab.names.index(name)
+            places, size = slab.place[slab.group == k], slab.sizes[k]
+        cut = [_local_condition(c, f"bcs[{name!r}]", places, size, slab, problem.fields) for c in conditions]
+        if any(c is not None for c in cut):
+            bcs[name] = [c for c in cut if c is not None]
+    return problem.replace(bcs=bcs)
+
+
+def _local_condition(
+    c: Condition, where: str, places: np.ndarray, size: int, slab: Slab, fields: int
+) -> Condition | None:
+    if c.kind in ("periodic", "interface"):
+        raise ValueError(f"{where}: js.{c.kind} is not made for several processes; use js.solve")
+    parts = dict(c.parts)
+    if c.kind == "fix":
+        wanted = np.array(c.indices)
+        if wanted.max() >= slab.count:
+            raise ValueError(f"{where}: particle {wanted.max()} does not exist; the cloud has {slab.count}")
+        at = np.minimum(np.searchsorted(slab.number, wanted), len(slab) - 1)
+        places, size = np.flatnonzero(slab.number[at] == wanted), len(wanted)
+        if not len(places):
+            return None
+        parts["indices"] = tuple(int(i) for i in at[places])
+    for name in c.numbers:
+        shape = np.shape(parts[name])
+        one_a_field = c.field is None and fields > 1 and shape == (fields,)
+        if shape and not one_a_field:
+            if shape[0] != size:
+                raise ValueError(f"{where}.{name}: shape {shape} for a group of {size} particles")
+            value = parts[name]
+            parts[name] = (value if isinstance(value, jax.Array) else np.asarray(value))[places]
+    out = Condition(c.kind, c.field, **parts)
+    out.numbers = c.numbers
+    return out

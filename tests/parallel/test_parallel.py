@@ -1,0 +1,99 @@
+"""``jsmitsm.parallel`` against one process, with 2 and 3 of them; skipped where there is no MPI or PETSc."""
+
+import importlib.util
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import meshio
+import numpy as np
+import pytest
+
+HERE = Path(__file__).parent
+MISSING = [name for name in ("mpi4py", "petsc4py") if importlib.util.find_spec(name) is None]
+MISSING += [] if shutil.which("mpiexec") else ["mpiexec"]
+pytestmark = pytest.mark.skipif(bool(MISSING), reason=f"several processes need {', '.join(MISSING)}")
+
+
+@pytest.fixture(scope="module", params=[2, 3])
+def found(request):
+    """What on_several.py found with so many processes; all of it in one run, since each start takes seconds."""
+    allowed = {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1", "OMP_NUM_THREADS": "1",
+               "OMPI_MCA_rmaps_base_oversubscribe": "1", "OMPI_MCA_mpi_yield_when_idle": "1",
+               "PYTHONPATH": str(HERE.parent.parent)}  # fmt: skip
+    command = ["mpiexec", "-n", str(request.param), sys.executable, str(HERE / "on_several.py")]
+    done = subprocess.run(command, env=os.environ | allowed, capture_output=True, text=True, timeout=900)
+    assert done.returncode == 0, done.stderr[-3000:]
+    return json.loads(done.stdout.strip().splitlines()[-1]) | {"processes": request.param}
+
+
+def test_rows_are_those_of_one_process(found):
+    # Sums of 15 terms below one in another order differ by less than 1e-14.
+    assert found["rows"] < 1e-14
+    # Weights of weak stencils reach several units.
+    assert found["graded rows"] < 1e-13
+
+
+def test_values_are_those_of_one_process(found):
+    # Round-off times the condition of a system of 400 unknowns, some 1e3.
+    for name in ("values hypre", "values gamg", "values mumps", "graded", "kernel", "III", "system", "cube", "read"):
+        assert found[name] < 1e-11, name
+
+
+def test_particles_are_shared_evenly(found):
+    # A column of the lattice stays together.
+    assert sum(found["own"]) == 400 and max(found["own"]) - min(found["own"]) <= 20
+    assert len(found["own"]) == found["processes"]
+
+
+def test_the_same_stencils_are_repaired(found):
+    assert found["repaired"][0] == found["repaired"][1] and found["repaired"][0]
+
+
+def test_multigrid_takes_few_iterations(found):
+    assert 1 <= found["iterations hypre"] <= 8 and found["iterations gamg"] <= 18
+
+
+def test_the_solution_anywhere(found):
+    assert found["anywhere"] < 1e-11
+    assert found["slopes"] < 1e-9  # a derivative divides by the spacing
+
+
+def test_the_estimate_is_that_of_one_process(found):
+    assert found["estimate"] < 1e-8
+
+
+def test_gradients_are_those_of_one_process(found):
+    assert found["value"] < 1e-9 and found["gradient"] < 1e-9
+    # Central differences of step 1e-5 have errors of round-off over the step, and of its square.
+    assert found["by points"] < 1e-6
+
+
+def test_files(found):
+    """All pieces together have the triangles of the square, each once."""
+    folder = Path(found["folder"])
+    assert (folder / "u.pvtu").read_text().count("<Piece") == found["processes"]
+    area = 0.0
+    for rank in range(found["processes"]):
+        mesh = meshio.read(folder / f"u_{rank}.vtu")
+        corners = mesh.points[mesh.cells[0].data][..., :2]
+        a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+        area += np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum() / 2.0
+        assert set(mesh.point_data) == {"u", "error"}
+    assert abs(area - 1.0) < 1e-12
+
+
+@pytest.mark.parametrize(
+    "what, words",
+    [
+        ("floating", "nothing fixes"), ("nonlinear", "nonlinear"), ("II", "'II' is none of"), ("periodic", "periodic"),
+        ("first order", "information travels"), ("one process", "on process 0"), ("array", "shape (3,)"),
+    ],
+)  # fmt: skip
+def test_what_is_not_made_is_refused_in_words(found, what, words):
+    if what == "one process":  # the one that failed says it without
+        words = "expected a js.Cloud"
+    assert words in found["refused"][what]
