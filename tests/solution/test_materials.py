@@ -235,7 +235,7 @@ def test_conditions_are_never_guessed():
     dot = js.sdf.circle((0.0, 0.0), 0.15)
     small = js.regions({"a": dot, "b": js.sdf.difference(js.sdf.rectangle(*BOX), dot)}, BOX, 0.1)
     refused(r"region 'a' is too small: .* particles are too few", cloud=small, order=8)
-    with pytest.raises(ValueError, match="several regions are for js.solve, js.factorize, js.evolve and js.eigen"):
+    with pytest.raises(ValueError, match="several regions are for js.solve, js.factorize, js.evolve, js.eigen"):
         js.tune(js.Problem(both, {**ends, "a|b": good}), cloud, js.Gaussian(0.1, 3.0))
     with pytest.raises(ValueError, match="give either flux"):
         js.interface()

@@ -60,6 +60,7 @@ class Regions:
     held: np.ndarray  # (N, F)
     images: Images
     kernel: None = None
+    part: None = None  # of a cloud that several processes share
     contrast: float = 1.0  # of the conductivities on both sides of an interface, the largest
 
     @property
