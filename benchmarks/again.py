@@ -223,8 +223,8 @@ def written(rows: list[list[str]], times: np.ndarray, first: np.ndarray) -> None
     about = machine.describe()
     note = (
         f"Milliseconds, the least of {ROUNDS} rounds in turns on {about['cores']} cores of {about['processor']} "
-        "(`python -m benchmarks.again --against=DIRECTORY`): before, with all modules in one folder, now without depth, "
-        "now as it is; and the ratios of the latter two to the first."
+        "(`python -m benchmarks.again --against=DIRECTORY`): before, with all modules in one folder, now without depth,"
+        " now as it is; and the ratios of the latter two to the first."
     )
     columns = ["", "before", "now, depth=0", "now", "ratio, depth=0", "ratio"]
     found = {"times": times.tolist(), "fresh processes": first.tolist()}

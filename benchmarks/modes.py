@@ -219,7 +219,8 @@ def table(lines: list[dict[str, Any]]) -> dict[str, Any]:
     spectra = [out for out in lines if out["case"] == "spectrum"]
     note = "Relative errors of values (`python -m benchmarks.modes`)."
     if spectra:
-        note += (f" Of {len(spectra)} spectra of diffusion, on jittered, Halton's and random clouds and a ball, "
+        kinds = " and ".join(dict.fromkeys(out["cloud"].split(",")[0] for out in spectra))
+        note += (f" Of {len(spectra)} spectra of diffusion, on clouds of the kind {kinds}, "
                  f"{sum(out['unstable'] > 0 for out in spectra)} have a growing mode.")  # fmt: skip
     columns = ["problem", "order", "unknowns", "first value above zero", "largest", "estimated / true error"]
     return {"columns": columns, "rows": rows, "note": note}

@@ -98,7 +98,9 @@ class Rounds:
             refused = 0
             shown.update(1)
             shown.note(f"{len(cloud)} particles, error {found.error:.1e}")
-            if self._done(sol, found, cloud, spacing):
+            done = self._done(sol, found, cloud, spacing)
+            self._clocked()
+            if done:
                 return
             if number == self.max_rounds - 1:
                 self._limit(f"the {self.max_rounds} rounds that were allowed (max_rounds)")
@@ -127,6 +129,13 @@ class Rounds:
         self.clock = now
         self.solution, self.error, self.number = sol, found.error, found.number
         return sol, found
+
+    def _clocked(self) -> None:
+        """What was spent since the last row belongs to its round: the check by another order."""
+        now = time.perf_counter()
+        *row, seconds, smallest = self.rows[-1]
+        self.rows[-1] = (*row, seconds + now - self.clock, smallest)  # type: ignore[assignment]
+        self.clock = now
 
     def _solve(self, cloud: Cloud, order: int, start: Any = None) -> Solution:
         options = dict(self.options)
@@ -237,7 +246,7 @@ class Rounds:
             self._limit(f"the {self.max_particles} particles that were allowed (max_particles)")
             return None
         most = min(max(_GROWTH * len(cloud), _SMALL[cloud.dim]), self.max_particles)
-        wanted = self.tol if error > self.tol else 0.5 * error if apart is None else _EASED * self.tol
+        wanted = _EASED * self.tol if apart is not None else self.tol if error > self.tol else 0.5 * error
         made_h, _ = next_spacing(here, power, error, wanted, most)
         if apart is not None:
             parted = marks(points, h, apart, power, None, _PARTED)

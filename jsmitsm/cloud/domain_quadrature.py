@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from jsmitsm.cloud.cloud import Cloud
-from jsmitsm.cloud.triangulation import boundary_facets, simplices
+from jsmitsm.cloud.triangulation import boundary_facets, lying_on, simplices
 from jsmitsm.taylor.multi_indices import multi_indices
 
 # A particle's normal counts at a facet if it is within 30 degrees of the facet's own; beyond, there is a corner.
@@ -36,6 +36,9 @@ def _layers(cloud: Cloud, degree: int) -> tuple[np.ndarray, np.ndarray]:
     """Points (M, Q, D) and signed weights (M, Q) between the facets and the boundary."""
     points = np.asarray(cloud.points, float)
     facets, normal = boundary_facets(cloud)
+    facets, normal = (x[~lying_on(cloud, facets)] for x in (facets, normal))
+    if not len(facets):
+        return np.zeros((0, 1, cloud.dim)), np.zeros((0, 1))
     corners = points[facets]
     height = _graphs(cloud, corners, facets, normal, degree)
     flat = np.broadcast_to(normal[:, None], corners.shape)

@@ -10,7 +10,7 @@ import numpy as np
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.cloud.domain_quadrature import domain_rule
 from jsmitsm.cloud.regions.region_cloud import RegionCloud, sides
-from jsmitsm.cloud.triangulation import boundary_facets
+from jsmitsm.cloud.triangulation import boundary_facets, lying_on
 from jsmitsm.taylor.multi_indices import multi_indices
 
 # A particle's normal shapes a facet if it is within 30 degrees of the facet's own; beyond, there is a corner.
@@ -131,7 +131,8 @@ def _vertex_normals(cloud: Cloud, facets: np.ndarray, normal: np.ndarray) -> np.
     if cloud.normals is None:
         return flat
     own = np.asarray(cloud.normals)[facets]
-    return np.where((np.sum(own * flat, axis=2) >= _SMOOTH)[..., None], own, flat)
+    smooth = (np.sum(own * flat, axis=2) >= _SMOOTH) & ~lying_on(cloud, facets)[:, None]
+    return np.where(smooth[..., None], own, flat)
 
 
 def _control_net(corners: np.ndarray, normals: np.ndarray) -> dict[tuple[int, ...], np.ndarray]:

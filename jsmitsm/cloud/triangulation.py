@@ -64,6 +64,14 @@ def boundary_facets(cloud: Cloud) -> tuple[np.ndarray, np.ndarray]:
     return facets, np.where(((into >= 0) & inside[into])[:, None], -normal, normal)
 
 
+def lying_on(cloud: Cloud, facets: np.ndarray) -> np.ndarray:
+    """Mask (M,) of the facets that are the boundary, not chords of it; of none where the cloud knows no shape."""
+    if cloud._shape is None or not len(facets):
+        return np.zeros(len(facets), bool)
+    points = np.asarray(cloud.points, float)
+    return np.abs(cloud._shape.distance(points[facets].mean(axis=1))[0]) < 1e-10 * np.ptp(points, axis=0).max()
+
+
 def _intervals(points: np.ndarray) -> np.ndarray:
     order = np.argsort(points[:, 0])
     return np.stack([order[:-1], order[1:]], axis=1)

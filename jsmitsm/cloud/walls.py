@@ -44,6 +44,7 @@ class Walls:
     ):  # fmt: skip
         self.points, self.ids, self.interior, self.groups = points, ids, interior, groups
         self.given = normals
+        self.kept: dict[Any, np.ndarray] = {}  # what others found by looking
         self.place = np.full(len(points), -1)
         self.place[ids] = np.arange(len(ids))
 

@@ -134,18 +134,27 @@ def _repaired(
     near = np.concatenate([cls.neighbours for cls in classes])
     best = _Best(Row(*map(np.concatenate, zip(*rows))), near, bool(scheme.n_own))
     width = min(len(points), round(2.2 * size))
-    for attempt in (wider(1.5), wider(2.2), balanced(1.0), balanced(1.5), balanced(2.2)):
+    kept = {} if disc.walls is None else disc.walls.kept
+    for number, attempt in enumerate((wider(1.5), wider(2.2), balanced(1.0), balanced(1.5), balanced(2.2))):
         left = np.flatnonzero(best.lebesgue > LEBESGUE)
         if not len(left):
             break
         # One shape for all attempts: compiling costs far more than computing a few rows twice.
         left = np.resize(left, len(ids))
-        tried = attempt(points, ids[left], size, disc.walls)[:, :width]
+        question = number, size, ids[left].tobytes()
+        if question not in kept:
+            if len(kept) >= _KEPT:
+                kept.clear()
+            kept[question] = attempt(points, ids[left], size, disc.walls)[:, :width]
+        tried = kept[question]
         # And few shapes for all clouds.
         trial = Class(ids[left], _widened(tried, rounded_width(width, 16), 1, -1), scheme)
         best.update(left, trial.neighbours, class_rows(disc, nums, trial, shared))
     return Class(ids, best.neighbours, scheme, classes[0].wide), best.row, ids[best.changed]
 
+
+# So many attempts are kept with the walls of a cloud, for the next solve on it.
+_KEPT = 16
 
 # Moment matrices are looked at so many at a time, as many as one small program serves.
 _PIECE = 128

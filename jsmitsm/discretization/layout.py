@@ -119,7 +119,9 @@ def discretize(
     sources: whether the weights of the source are wanted even where it is zero; part: where the cloud is a part.
     """
     if isinstance(cloud, RegionCloud) or isinstance(problem.pde, PerRegion):
-        raise ValueError("problem: several regions are solved by js.solve alone; this is not made for them")
+        raise ValueError(
+            "problem: several regions are for js.solve, js.factorize, js.evolve and js.eigen; this is not made for them"
+        )
     refuse_extras(problem)
     kernel = kernel and kernel.recorded()
     traced = _traced(problem, cloud.dim)

@@ -72,7 +72,8 @@ def _traced_entries(disc: Discretization, cls: Class, row: Row) -> tuple[Any, An
     shape = (*own.shape, *column.shape[1:])
     r, c = np.broadcast_to(own[:, :, None, None], shape), jnp.broadcast_to(column[:, None], shape)
     keep = (r >= 0) & (c >= 0)
-    return tuple(jnp.where(keep, x, 0).ravel() for x in (-row.weights, r, c))
+    values, at, to = (jnp.where(keep, x, 0).ravel() for x in (-row.weights, r, c))
+    return values, at, to
 
 
 @in_one_program

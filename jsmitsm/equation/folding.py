@@ -20,6 +20,8 @@ def folded(written: Program) -> Program:
 
     The arrays that it closes over are not looked at: they may be others in a record that JAX has carried along.
     """
+    if not any(eqn.primitive.name == "iota" for eqn in written.eqns):  # of which unit vectors are made
+        return written
     inputs = (*written.constvars, *written.invars)
     facts: dict[Any, Facts] = {v: unknown(v.aval.shape, v.aval.dtype) for v in inputs}
     instead: dict[Any, Any] = {}

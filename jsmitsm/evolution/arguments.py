@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, Literal, TypeAlias, get_args
 
 import jax
@@ -10,8 +11,8 @@ import numpy as np
 
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.cloud.regions.region_cloud import RegionCloud
+from jsmitsm.discretization.regions.rows import spread_values
 from jsmitsm.equation.problem import Problem
-from jsmitsm.equation.regions.per_region import PerRegion
 from jsmitsm.equation.unknowns.extras import refuse_extras
 from jsmitsm.runtime.errors import did_you_mean, is_number, is_whole, refuse_masked, short
 from jsmitsm.runtime.tracers import is_traced
@@ -29,8 +30,6 @@ def check(problem, cloud, t, steps, tol, order, scheme, throw, progress) -> None
     for value, kind, name in ((problem, Problem, "problem"), (cloud, Cloud, "cloud")):
         if not isinstance(value, kind):
             raise ValueError(f"{name}: expected a js.{kind.__name__}, got {type(value).__name__}")
-    if isinstance(cloud, RegionCloud) or isinstance(problem.pde, PerRegion):
-        raise ValueError("problem: js.evolve does problems of one region; several are done by js.solve alone")
     if not isinstance(t, (tuple, list)) or len(t) != 2:
         raise ValueError(f"t: expected the start and the end, t=(t0, t1), got {short(t)}")
     if not is_traced(t):
@@ -99,6 +98,8 @@ def starting_values(u0: Any, cloud: Cloud, fields: int, second: bool) -> tuple[A
 
 def _values(given: Any, cloud: Cloud, fields: int, name: str) -> Any:
     n = len(cloud)
+    if isinstance(given, Mapping):
+        return _of_regions(given, cloud, fields, name)
     if callable(given):
         try:
             values: Any = jax.vmap(lambda x: _vector(given(x), fields, name))(jnp.asarray(cloud.points))
@@ -124,6 +125,15 @@ def _values(given: Any, cloud: Cloud, fields: int, name: str) -> Any:
         bad = int(np.flatnonzero(~np.isfinite(values).all(axis=1))[0])
         raise ValueError(f"{name}: NaN or infinite at particle {bad}; start from finite values")
     return values
+
+
+def _of_regions(given: Mapping[str, Any], cloud: Cloud, fields: int, name: str) -> Any:
+    """Values (N, F) by region."""
+    if not isinstance(cloud, RegionCloud) or set(given) != set(cloud.regions):
+        known = list(cloud.regions) if isinstance(cloud, RegionCloud) else "none"
+        raise ValueError(f"{name}: values for the regions {list(given)}; the cloud has {known}")
+    found = [_values(given[r], cloud.region(r), fields, f"{name}[{r!r}]") for r in cloud.regions]
+    return spread_values(found, list(cloud.regions.values()), (len(cloud), fields))
 
 
 def _vector(value: Any, fields: int, name: str) -> Any:

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from jsmitsm.discretization.pencil.assemble import assemble_pencil
 from jsmitsm.evolution.run import Run
 from jsmitsm.evolution.space.semidiscrete import Semidiscrete
 from jsmitsm.evolution.steps import dense_output
@@ -30,19 +29,13 @@ def estimated(
     out = np.zeros((len(times), semi.n, semi.fields))
     if len(steps) > 1 and not run.timed.quasilinear and run.order + 2 <= HIGHEST:
         grid = np.linspace(steps[0], steps[-1], min(LOOKS, len(steps) - 1) + 1)
-        errors = np.abs(_integrated(semi, _higher(run), steps, values, rates, grid))
+        errors = np.abs(_integrated(semi, run.finer(), steps, values, rates, grid))
         index = np.clip(np.searchsorted(grid, times), 1, len(grid) - 1)
         part = ((times - grid[index - 1]) / (grid[index] - grid[index - 1]))[:, None, None]
         out = (1.0 - part) * errors[index - 1] + part * errors[index]
     out += in_time[:, None, None]
     out.reshape(len(times), -1)[1:, semi.held] = 0.0
     return out
-
-
-def _higher(run: Run) -> Semidiscrete:
-    problem = run.timed.at(np.asarray(float(run.t[0])), run.params)
-    pencil = assemble_pencil(problem, run.cloud, order=run.order + 2, depth=run.depth)
-    return Semidiscrete(run.timed, pencil, run.params, 0.0)
 
 
 def _integrated(

@@ -10,13 +10,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm.cloud.cloud import Cloud
-from jsmitsm.evolution.space.local_fits import StateFit
+from jsmitsm.cloud.regions.region_cloud import RegionCloud
+from jsmitsm.evolution.space.local_fits import state_fit
 from jsmitsm.evolution.steps import dense_output
 from jsmitsm.runtime import notebooks
 from jsmitsm.runtime.arrays import Array
 from jsmitsm.runtime.errors import explained
 from jsmitsm.runtime.tracers import frozen, is_traced
 from jsmitsm.solution.fit import Recipe
+from jsmitsm.solution.regions.solution import RegionsSolution
 from jsmitsm.solution.solution import Solution
 
 
@@ -169,8 +171,9 @@ class Evolution:
     def _solution(self, u: np.ndarray, time: float) -> Solution:
         stats = {"messages": [f"The state at t = {time:g} of an evolution."]}
         if self._fit is None:
-            self._fit = StateFit(self.cloud, self._recipe.reach)
-        return Solution(u, self.cloud, self._recipe, self._fit, self.converged, 1, stats)
+            self._fit = state_fit(self.cloud, self._recipe.reach)
+        kind = RegionsSolution if isinstance(self.cloud, RegionCloud) else Solution
+        return kind(u, self.cloud, self._recipe, self._fit, self.converged, 1, stats)
 
     def error_estimate(self) -> Array:
         """Estimated error at every particle and saved time.

@@ -12,12 +12,14 @@ from jsmitsm.evolution.arguments import Scheme, check, saved_times, starting_val
 from jsmitsm.evolution.evolution import Evolution
 from jsmitsm.evolution.gradient.differentiable import differentiable
 from jsmitsm.evolution.march import march
+from jsmitsm.evolution.regions.run import RegionsRun
+from jsmitsm.evolution.regions.timed import regions_timed
 from jsmitsm.evolution.run import Run
 from jsmitsm.evolution.space.timed import timed
 from jsmitsm.runtime.arrays import ValueOrFunction
 from jsmitsm.runtime.progress import bar
 from jsmitsm.runtime.tracers import is_traced
-from jsmitsm.solution.arguments import Depth
+from jsmitsm.solution.arguments import Depth, of_regions
 
 
 def evolve(
@@ -51,8 +53,9 @@ def evolve(
     cloud : Cloud
         The particles it is solved on.
     u0 : function, array_like or pair of them
-        The start, a function of x, a number or an array (N,) or (N, F); for second order in time a pair of them, u
-        and its rate. Where it differs from the conditions the run begins with the impulse that this is.
+        The start, a function of x, a number or an array (N,) or (N, F), with several regions also a dict of functions
+        or numbers by region; for second order in time a pair of them, u and its rate. Where it differs from the
+        conditions the run begins with the impulse that this is.
     t : pair of float
         (t0, t1), the start and the end.
     steps : int, optional
@@ -90,7 +93,8 @@ def evolve(
     Raises
     ------
     ValueError
-        For bad input, and for problems that this cannot do: pure advection, conditions nonlinear in u.
+        For bad input, and for problems that this cannot do: pure advection, conditions nonlinear in u; with several
+        regions, nonlinear equations and second order in time.
     SolveError
         For a run that blew up, a stage that did not converge, steps that became too small.
 
@@ -118,14 +122,15 @@ def evolve(
     """
     began = time.perf_counter()
     check(problem, cloud, t, steps, tol, order, scheme, throw, progress)
-    made = timed(problem, cloud)
+    several = of_regions(problem, cloud)
+    made: Any = regions_timed(problem, cloud) if several else timed(problem, cloud)  # type: ignore[arg-type]
     second = bool(made.masses[1].slots)
     start = starting_values(u0, cloud, problem.fields, second)
     options: dict[str, Any] = {
         "order": int(order), "scheme": scheme, "damping": damping, "stencils": stencils, "throw": throw,
         "depth": 0 if depth == "auto" else depth,
     }  # fmt: skip
-    run = Run(made, cloud, start, t, began, **options)
+    run = (RegionsRun if several else Run)(made, cloud, start, t, began, **options)
     if is_traced(t):
         if not (save is None or isinstance(save, int)):
             raise ValueError("save: where t is traced by JAX, give a number of intervals instead of times")

@@ -10,8 +10,6 @@ import numpy as np
 from jsmitsm.evolution.estimate import estimated
 from jsmitsm.evolution.evolution import Evolution, Report
 from jsmitsm.evolution.run import Run, drifted
-from jsmitsm.evolution.space.local_fits import StateFit
-from jsmitsm.evolution.space.semidiscrete import local_fits
 from jsmitsm.evolution.steps import dense_output
 from jsmitsm.evolution.steps.control import controlled
 from jsmitsm.evolution.steps.in_time import InTime, looks
@@ -229,10 +227,9 @@ def _finished(run: Run, parts: np.ndarray, history: History, fault: str, began: 
     if in_time is not None and in_time > LARGE:
         flags.append(f"The estimated error in time is {in_time:.0%} of the solution: take more steps, or a tol.")
     stats = _statistics(run, began, in_time)
-    disc = run.semi.disc
     degree = min(run.order + 2, HIGHEST)
     recipe = Recipe("S", run.order, None, "loo", run.fields, degree - run.order)
-    fit = StateFit(run.cloud, degree, lambda: local_fits(disc, degree))
+    fit = run.semi.state_fit(degree)
     kept = np.array(history.times), np.stack(history.states)
     moved = np.stack(history.rates) if history.rates else None
     report = Report(flags, told, lambda: estimated(run, np.asarray(times), kept, moved, later))

@@ -55,8 +55,8 @@ def solve(
     elliptic: bool = True,
     refine: int = 1,
     info: dict[str, Any] | None = None,
-) -> jax.Array:
-    """Solution x of A x = b, with A given by its entries.
+) -> Any:
+    """Solution x of A x = b, with A given by its entries: a numpy array where nothing is traced.
 
     Args:
       data: (nnz,) float, the entries; those at one place add up.

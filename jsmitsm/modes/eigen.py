@@ -11,18 +11,18 @@ import numpy as np
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.cloud.neighbours import Stencils
 from jsmitsm.discretization.layout import Discretization
-from jsmitsm.discretization.pencil.assemble import Pencil, assemble_pencil
+from jsmitsm.discretization.pencil.assemble import Pencil
 from jsmitsm.equation.problem import Problem
 from jsmitsm.equation.unknowns.extras import refuse_extras
 from jsmitsm.modes.estimate import errors
 from jsmitsm.modes.modes import Modes
-from jsmitsm.modes.question import Question, masses, reduced
+from jsmitsm.modes.question import Question, assembled, masses, operators, reduced
 from jsmitsm.modes.spectrum import in_real_numbers, modes, normalised, pairs
 from jsmitsm.runtime.arrays import ValueOrFunction
 from jsmitsm.runtime.errors import SolveError, short
 from jsmitsm.runtime.progress import bar
 from jsmitsm.runtime.tracers import concrete, is_traced
-from jsmitsm.solution.arguments import Depth, check
+from jsmitsm.solution.arguments import Depth, check, of_regions
 
 # A condition's value or a source up to this part of what it stands beside is rounding.
 _NOTHING = 1e-12
@@ -62,8 +62,8 @@ def eigen(
         A real number; the values nearest to it are found.
     mass : float, array or function, optional
         A number, an array (F,), or a function of x (and of the problem's params, where it takes two arguments),
-        scalar or (F,); 1 if not given. Equation k has the mass times field k on its right-hand side; zero for an
-        equation without it.
+        scalar or (F,), with several regions also a dict of these by region; 1 if not given. Equation k has the mass
+        times field k on its right-hand side; zero for an equation without it.
     method : {"S"}
         "S", the only one whose rows know their source.
     order : int
@@ -104,7 +104,8 @@ def eigen(
     check(problem, cloud, "S", order, None, stencils, throw=throw, depth=depth)
     _check(problem, count, near, method)
     weights, massed = masses(problem, cloud, mass)
-    pencil = assemble_pencil(problem, cloud, order=order, mass=tuple(massed), stencils=stencils, depth=depth)
+    of_regions(problem, cloud)
+    pencil = assembled(problem, cloud, order=order, mass=tuple(massed), stencils=stencils, depth=depth)
     disc = pencil.layout.disc
     _refuse_data(disc, pencil)
     fields = problem.fields
@@ -188,11 +189,12 @@ def _finite(value: Any) -> bool:
 
 def _refuse_data(disc: Discretization, pencil: Pencil) -> None:
     """Values of conditions and sources, which an eigenvalue problem has none of."""
-    source = disc.traced.coefficients(disc.cloud.points, 0, params=disc.problem.params)[1]
-    if source is not None and not is_traced(source) and np.abs(source).max(initial=0.0) > 0.0:
-        raise ValueError(
-            "pde: it has a source, a part without u, but modes are of L u = lambda mass u; leave that part out"
-        )
+    for one, _ in operators(pencil):
+        source = one.traced.coefficients(one.cloud.points, 0, params=one.problem.params)[1]
+        if source is not None and not is_traced(source) and np.abs(source).max(initial=0.0) > 0.0:
+            raise ValueError(
+                "pde: it has a source, a part without u, but modes are of L u = lambda mass u; leave that part out"
+            )
     held, given = (concrete(x) for x in (pencil.held_values, pencil.conditions))
     for values in (held, given):
         if values is not None and np.abs(np.asarray(values)).max(initial=0.0) > _NOTHING:

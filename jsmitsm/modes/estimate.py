@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from jsmitsm.discretization.pencil.assemble import Pencil, assemble_pencil
-from jsmitsm.modes.question import Question, reduced
+from jsmitsm.discretization.pencil.assemble import Pencil
+from jsmitsm.modes.question import Question, assembled, reduced
 from jsmitsm.modes.spectrum import Pairs
 from jsmitsm.runtime.errors import SolveError
 from jsmitsm.taylor.multi_indices import HIGHEST
@@ -52,7 +52,7 @@ def _other_order(question: Question) -> Pencil | None:
         if order + question.depth > HIGHEST:
             continue
         try:
-            question.other = assemble_pencil(
+            question.other = assembled(
                 question.problem, cloud, order=order, mass=tuple(question.massed), depth=question.depth
             )
             return question.other

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
@@ -11,6 +11,7 @@ import numpy as np
 
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.discretization.layout import table
+from jsmitsm.discretization.regions.layout import Regions
 from jsmitsm.modes.estimate import errors
 from jsmitsm.modes.question import Question, mass_at
 from jsmitsm.modes.spectrum import Pairs
@@ -18,6 +19,8 @@ from jsmitsm.runtime.arrays import Array, ArrayLike
 from jsmitsm.runtime.errors import explained, short, some
 from jsmitsm.runtime.tracers import frozen, is_traced, owned
 from jsmitsm.solution.fit import Fit, Recipe
+from jsmitsm.solution.regions.fit import RegionsFit
+from jsmitsm.solution.regions.solution import RegionsSolution
 from jsmitsm.solution.solution import Solution
 
 # An estimated error above this part of the value is a flag; of values near zero, of this part of the largest.
@@ -207,14 +210,20 @@ class Modes:
         value, u = (jnp.real(x) if is_traced(x) else np.real(x) for x in (value, u))
         written, number = q.problem, jnp.asarray(value)
 
-        def pde(u: Any, x: Any, *params: Any) -> Any:
-            return written.pde(u, x, *params) - number * mass_at(written, q.mass, x) * u(x)
+        def shifted(operator: Any, mass: Any) -> Any:
+            return lambda u, x, *params: operator(u, x, *params) - number * mass_at(written, mass, x) * u(x)
 
-        disc = q.pencil.layout.disc
-        disc.classes = [cls for cls, _ in q.pencil.layout.classes]
+        disc: Any = q.pencil.layout.disc
         recipe = Recipe("S", q.order, None, "loo", written.fields, q.depth)
-        fit = Fit(written.replace(pde=pde), disc.cloud, None, table(disc), None, recipe)
-        made = Solution(u, disc.cloud, recipe, fit, self.converged, 1, {})
+        made: Solution
+        if isinstance(disc, Regions):
+            pde = {n: shifted(f, q.mass[n] if isinstance(q.mass, Mapping) else q.mass) for n, f in written.pde.items()}
+            whole = RegionsFit(written.replace(pde=pde), disc.cloud, disc.near, None, recipe)
+            made = RegionsSolution(u, disc.cloud, recipe, whole, self.converged, 1, {})
+        else:
+            disc.classes = [cls for cls, _ in q.pencil.layout.classes]
+            fit = Fit(written.replace(pde=shifted(written.pde, q.mass)), disc.cloud, None, table(disc), None, recipe)
+            made = Solution(u, disc.cloud, recipe, fit, self.converged, 1, {})
         if not is_traced(value, u):
             self._fitted[k] = made
         return made

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,8 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm.cloud.cloud import Cloud
+from jsmitsm.cloud.regions.region_cloud import RegionCloud
 from jsmitsm.discretization.layout import Discretization, mean_spacing
-from jsmitsm.discretization.pencil.assemble import Pencil
+from jsmitsm.discretization.pencil.assemble import Pencil, assemble_pencil
+from jsmitsm.discretization.regions.layout import Regions
+from jsmitsm.discretization.regions.pencil import assemble_regions_pencil
+from jsmitsm.discretization.regions.rows import spread_values
 from jsmitsm.equation.problem import Problem
 from jsmitsm.modes.spectrum import Pattern
 from jsmitsm.runtime.errors import IN_FUNCTIONS, in_words, short
@@ -35,16 +39,30 @@ class Question:
 
     def highest(self) -> float:
         """The value, about, of a wave of four particles: beyond it nothing is resolved."""
-        disc = self.pencil.layout.disc
-        jac, _ = disc.traced.coefficients(disc.cloud.points, 0, params=disc.problem.params)
-        number = 0.5 * np.pi / mean_spacing(disc)
         out = np.inf
-        for e in np.flatnonzero(self.massed):
-            m = disc.traced.order[e]
-            lead = [s for s, (_, b) in enumerate(disc.rec.slots) if sum(b) == m]
-            size = float(np.median(np.abs(np.asarray(jac)[e, lead, 0]).max(axis=0)))
-            out = min(out, size * number**m / float(np.abs(self.weights[:, e]).max()))
+        for disc, ids in operators(self.pencil):
+            jac, _ = disc.traced.coefficients(disc.cloud.points, 0, params=disc.problem.params)
+            number = 0.5 * np.pi / mean_spacing(disc)
+            for e in np.flatnonzero(self.massed):
+                m = disc.traced.order[e]
+                lead = [s for s, (_, b) in enumerate(disc.rec.slots) if sum(b) == m]
+                size = float(np.median(np.abs(np.asarray(jac)[e, lead, 0]).max(axis=0)))
+                most = float(np.abs(self.weights[ids, e]).max())
+                out = min(out, size * number**m / most) if most else out
         return out
+
+
+def operators(pencil: Pencil) -> list[tuple[Discretization, Any]]:
+    """The discretisation of every region, and its particles; of a problem with one region that of all."""
+    disc: Any = pencil.layout.disc
+    return [(p.disc, p.ids) for p in disc.parts] if isinstance(disc, Regions) else [(disc, slice(None))]
+
+
+def assembled(problem: Problem, cloud: Cloud, **options: Any) -> Pencil:
+    """The pencil of a problem with one region or several."""
+    if isinstance(cloud, RegionCloud):
+        return assemble_regions_pencil(problem, cloud, **options)
+    return assemble_pencil(problem, cloud, **options)
 
 
 def reduced(pencil: Pencil, weights: Any) -> tuple[Pattern, Any, Any]:
@@ -63,23 +81,23 @@ def reduced(pencil: Pencil, weights: Any) -> tuple[Pattern, Any, Any]:
     points = None if points is None else np.asarray(points)[pencil.free // disc.rec.fields]
     a, c = entries
     rows_a, cols_a, rows_c, cols_c = places
-    offset = _offset(disc, (concrete(a), rows_a), (concrete(c), rows_c))
+    offset = _offset(pencil, (concrete(a), rows_a), (concrete(c), rows_c))
     pattern = Pattern(
         len(pencil.free), rows_a, cols_a, rows_c, cols_c, points, disc.rec.order, offset, bool(disc.floating)
     )
     return pattern, a, c
 
 
-def _offset(disc: Discretization, *matrices: tuple[Any, np.ndarray]) -> float:
+def _offset(pencil: Pencil, *matrices: tuple[Any, np.ndarray]) -> float:
     """About a tenth of the lowest value: the largest one times the spacing over the size to the operator's order."""
     if any(entries is None for entries, _ in matrices):
         return 0.1
-    n = len(disc.cloud) * disc.rec.fields
+    disc, n = pencil.layout.disc, pencil.A.shape[0]
     rows = [np.bincount(r, np.abs(np.asarray(x)), n) for x, r in matrices]
     ratio = rows[0][rows[1] > 0] / rows[1][rows[1] > 0]
     points = np.asarray(concrete(disc.cloud.points))
     part = mean_spacing(disc) / float(np.ptp(points, axis=0).max())
-    return 0.1 * float(np.median(ratio)) * part ** max(disc.traced.order)
+    return 0.1 * float(np.median(ratio)) * part ** max(max(one.traced.order) for one, _ in operators(pencil))
 
 
 def masses(problem: Problem, cloud: Cloud, mass: Any) -> tuple[Any, np.ndarray]:
@@ -87,6 +105,8 @@ def masses(problem: Problem, cloud: Cloud, mass: Any) -> tuple[Any, np.ndarray]:
     n, fields = len(cloud), problem.fields
     if mass is None:
         return np.ones((n, fields)), np.ones(fields, bool)
+    if isinstance(mass, Mapping):
+        return _masses_of_regions(problem, cloud, mass)
     if callable(mass):
         values = _sampled(problem, cloud, mass)
     else:
@@ -116,6 +136,16 @@ def masses(problem: Problem, cloud: Cloud, mass: Any) -> tuple[Any, np.ndarray]:
     if not massed.any():
         raise ValueError("mass: zero in every equation, so no number multiplies u; give one equation a mass")
     return values, massed
+
+
+def _masses_of_regions(problem: Problem, cloud: Cloud, mass: Mapping[str, Any]) -> tuple[Any, np.ndarray]:
+    """The same, region by region."""
+    known = list(cloud.regions) if isinstance(cloud, RegionCloud) else []
+    if not isinstance(cloud, RegionCloud) or set(mass) != set(known):
+        raise ValueError(f"mass: given for the regions {list(mass)}; the cloud has {known or 'none'}")
+    found = [masses(problem, cloud.region(name), mass[name]) for name in known]
+    values = spread_values([v for v, _ in found], list(cloud.regions.values()), (len(cloud), problem.fields))
+    return values, np.any([some for _, some in found], axis=0)
 
 
 def _sampled(problem: Problem, cloud: Cloud, mass: Callable[..., Any]) -> Any:

@@ -316,11 +316,12 @@ program_p.multiple_results = True
 
 
 def _impl(*arguments: Any, program: Program) -> list[Any]:
-    shared = None if program.rows is None else program.rows.shares(arguments)
-    if shared is not None:
+    rows = program.rows
+    shared = None if rows is None else rows.shares(arguments)
+    if rows is not None and shared is not None:
         one = lambda share: [np.asarray(x) for x in jax.tree.leaves(program.run(*share.arguments))]  # noqa: E731
         parts = side_by_side(one, shared, lambda share: (program, share.rows))
-        return [jax.device_put(x) for x in program.rows.together(list(parts), shared)]
+        return [jax.device_put(x) for x in rows.together(list(parts), shared)]
     out = jax.tree.leaves(program.run(*arguments))
     if program.on_host:
         avals = program.result(_avals(arguments)).avals

@@ -275,7 +275,7 @@ def steps(values: np.ndarray, levels: int) -> np.ndarray:
     lo, hi = float(values.min()), float(values.max())
     if hi - lo <= 1e-12 * max(abs(lo), abs(hi), 1e-300):
         lo, hi = lo - 0.5, hi + 0.5
-    between = MaxNLocator(levels + 1).tick_values(lo, hi)
+    between: Any = MaxNLocator(levels + 1).tick_values(lo, hi)
     slack = 1e-2 * (hi - lo)  # a band that rounding alone makes would promise values that do not occur
     return np.concatenate([[lo], between[(between > lo + slack) & (between < hi - slack)], [hi]])
 

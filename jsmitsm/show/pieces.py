@@ -156,7 +156,8 @@ def outline(cloud: Cloud, axis: int = -1, position: float = 0.0) -> list[np.ndar
     grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     there = grid if axis < 0 else np.insert(grid, axis, position, axis=1)
     level = shape.distance(there)[0].reshape(len(y), len(x))
-    return [loop[:-1] for loop in contour_generator(x, y, level).lines(0.0) if len(loop) > 4]
+    loops: Any = contour_generator(x, y, level).lines(0.0)
+    return [loop[:-1] for loop in loops if len(loop) > 4]
 
 
 def clipped(ax: Any, artist: Any, loops: list[np.ndarray]) -> None:

@@ -290,6 +290,8 @@ def _directed(sol: Solution, of: Callable | None) -> Callable[[np.ndarray], np.n
     def directed(points: np.ndarray) -> np.ndarray:
         values = np.asarray(sol(points))
         inside = np.isfinite(values).reshape(len(points), -1).all(axis=1)
+        if sol.cloud._shape is not None and not isinstance(sol.cloud, RegionCloud):
+            inside &= sol.cloud._shape.distance(points)[0] <= 0
         if of is None:
             found = drawing.real("sol", sol.grad(points) if fields == 1 else values[:, :dim])
         else:

@@ -41,10 +41,10 @@ def in_domain(cloud: Cloud, points: Any, outside: str, first: Nearest | None = N
     if not beyond.any():
         return None
     if outside == "raise":
-        first = int(np.argmax(beyond))
-        at = np.asarray(jax.lax.stop_gradient(points))[first] if not is_traced(points) else first
+        at_first = int(np.argmax(beyond))
+        at = np.asarray(jax.lax.stop_gradient(points))[at_first] if not is_traced(points) else at_first
         raise ValueError(
-            f"points: {int(beyond.sum())} of {len(beyond)} lie outside of the domain, first points[{first}] = {at}; "
+            f"points: {int(beyond.sum())} of {len(beyond)} lie outside of the domain, first points[{at_first}] = {at}; "
             'take them out, or say outside="nan" or outside="extrapolate"'
         )
     return ~beyond

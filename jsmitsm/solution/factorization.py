@@ -19,8 +19,9 @@ from jsmitsm.linear.linsolve import Solver
 from jsmitsm.particle.kernels import Kernel
 from jsmitsm.runtime.progress import bar
 from jsmitsm.runtime.tracers import is_traced
-from jsmitsm.solution.arguments import Depth, Formulation, Method, check, discretized
+from jsmitsm.solution.arguments import Depth, Formulation, Method, check, discretized, of_regions
 from jsmitsm.solution.fit import Fit, Recipe
+from jsmitsm.solution.regions.factorization import RegionsFactorization
 from jsmitsm.solution.run import Run
 from jsmitsm.solution.solution import Solution
 
@@ -145,7 +146,7 @@ def factorize(
     problem: Problem, cloud: Cloud, *, method: Method = "S", order: int = 4, kernel: Kernel | None = None,
     stencils: Stencils | None = None, basis_terms: int | None = None, formulation: Formulation = "auto",
     solver: Solver = "auto", depth: Depth = "auto",
-) -> Factorization:  # fmt: skip
+) -> Factorization | RegionsFactorization:  # fmt: skip
     """Prepare a linear problem for many right-hand sides.
 
     What a change of the source or of the values in the conditions leaves valid is kept: neighbours, moment
@@ -182,6 +183,11 @@ def factorize(
     >>> round(float(ready.solve(heated(8.0)).u[5]), 10)
     1.0
     """
+    if of_regions(problem, cloud):
+        return RegionsFactorization(
+            problem, cloud, method=method, order=order, kernel=kernel, stencils=stencils, basis_terms=basis_terms,
+            formulation=formulation, solver=solver, depth=depth,
+        )  # fmt: skip
     disc = discretized(problem, cloud, method, order, kernel, stencils, basis_terms, formulation, solver, depth)
     if not disc.linear:
         raise ValueError("problem: it is nonlinear, so its matrix changes in every step; use js.solve")

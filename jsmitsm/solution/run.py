@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from functools import cached_property, partial
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -256,7 +256,7 @@ class Run:
     def _solvable(self, data: Any, r: Any, c: Any, b: Any, x: Any, points: Any) -> Any:
         """Under a JAX transform, where nothing raises: whether the system is regular, and floating data balance."""
         n = int((~self.disc.held).sum())
-        known, xp = (concrete(b), concrete(x)), np
+        known, xp = (concrete(b), concrete(x)), cast(Any, np)
         if any(v is None for v in known):  # else nothing but a derivative is traced, and this has none
             known, xp = (b, x), jnp
         largest, size = (xp.max(xp.abs(xp.asarray(v)), initial=0.0) for v in known)

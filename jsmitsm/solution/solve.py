@@ -28,7 +28,7 @@ from jsmitsm.solution.regions.solve import solve_regions
 from jsmitsm.solution.run import Run
 from jsmitsm.solution.solution import Solution
 from jsmitsm.solution.unknowns.bordered import BorderedRun
-from jsmitsm.solution.unknowns.complex_solution import ComplexSolution
+from jsmitsm.solution.unknowns.complex_solution import complex_solution
 from jsmitsm.solution.unknowns.constrained import solve_constrained
 from jsmitsm.solution.unknowns.point_solution import PointSolution, check_inside
 
@@ -175,15 +175,18 @@ def recipe_of(run: Run) -> Recipe:
 def with_extras(problem: Problem, cloud: Cloud, *, order: Any, **options: Any) -> Solution:
     """The solution of a problem with constraints, complex values or point sources; options as those of ``js.solve``."""
     assert problem.extras is not None
-    if isinstance(cloud, RegionCloud) or isinstance(problem.pde, PerRegion):
+    several = isinstance(cloud, RegionCloud) or isinstance(problem.pde, PerRegion)
+    if several and not problem.extras.complex_values:
         raise ValueError(
-            "problem: constraints, unknowns, sources and dtype=complex are not made for several regions; use one region"
+            "problem: constraints, unknowns and sources are not made for several regions; use one region, and in place "
+            "of a point source a Gaussian in the pde, strength exp(-|x - x0|^2 / (2 w^2)) / (2 pi w^2)^(D/2) with w "
+            "about three spacings"
         )
     if problem.extras.complex_values:
         if options["method"] not in ("S", "SSPH"):
             raise ValueError(f'method: {options["method"]} treats one real field; use "S" for dtype=complex')
         options["u0"] = two_parts(options["u0"], problem.fields)
-        return ComplexSolution.of(solve(two_fields(problem), cloud, order=order, **options))
+        return complex_solution(solve(two_fields(problem), cloud, order=order, **options))
     if problem.extras.sources:
         regular, singular = regular_problem(problem, cloud)
         check_inside(singular, cloud)

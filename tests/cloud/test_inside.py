@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jsmitsm as js
-from jsmitsm.cloud.inside import inside_of
+from jsmitsm.cloud.inside import Table, inside_of
 
 STAR = [(r * np.cos(t), r * np.sin(t)) for r, t in zip([1.0, 0.45] * 5, np.arange(10) * np.pi / 5)]
 ELL = [(0, 0), (2, 0), (2, 1), (1, 1), (1, 2), (0, 2)]
@@ -175,3 +175,16 @@ def test_the_integral_of_a_solution(sol):
     np.testing.assert_allclose(two.integral(), [1 / 3, 1 / 2], rtol=1e-11)
     with pytest.raises(ValueError, match="degree: expected a whole number"):
         js.quadrature(sol.cloud, degree=0)
+
+
+def test_a_table_finds_the_nearest_particles_of_a_tree():
+    cloud = js.rectangle((0, 0), (3, 1), (31, 11), jitter=0.3)
+    domain = inside_of(cloud)
+    table = Table.of(domain.points, domain.trees[0])
+    assert table is not None
+    points = np.random.default_rng(0).uniform((0, 0), (3, 1), (5000, 2))
+    for some in (points, np.concatenate([points[:10], [[5.0, 5.0]]])):  # one outside of the grid
+        distance, number = domain.trees[0].query(some)
+        found = table.nearest(some)
+        np.testing.assert_array_equal(found.number, number)
+        np.testing.assert_allclose(found.distance, distance, rtol=1e-14)

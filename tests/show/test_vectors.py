@@ -68,6 +68,18 @@ def test_sides_of_a_region_that_end_at_a_corner_are_found_whole():
     assert abs(js.quadrature(part, "fibre|matrix").weights.sum() / (0.15 * np.pi) - 1) < 1e-3
 
 
+def test_blunt_corners_of_a_polygon_are_no_curve():
+    """A cape that turns by fifty degrees: its bisector is within thirty of both sides."""
+    turns = np.radians(np.arange(0, 360, 51.43))
+    heptagon = js.from_polygon(np.c_[np.cos(turns), np.sin(turns)], 0.21)
+    corner = np.c_[np.cos(turns), np.sin(turns)]
+    ahead = np.roll(corner, -1, axis=0)
+    area = 0.5 * (corner[:, 0] @ ahead[:, 1] - corner[:, 1] @ ahead[:, 0])
+    assert abs(js.quadrature(heptagon).weights.sum() / area - 1) < 1e-12
+    length = np.linalg.norm(ahead - corner, axis=1).sum()
+    assert abs(js.quadrature(heptagon, "boundary").weights.sum() / length - 1) < 1e-12
+
+
 def test_arrows_are_the_field_and_stay_inside(flat):
     (quiver,) = [c for c in js.plot.vectors(flat, count=10).collections if hasattr(c, "U")]
     x, y = quiver.get_offsets().T

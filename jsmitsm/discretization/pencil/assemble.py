@@ -93,7 +93,7 @@ def assemble_pencil(
 
     Raises ValueError for stencils that are too narrow, SolveError for rows that determine nothing.
     """
-    free, depth = depth == "auto", _DEPTH[cloud.dim] if depth == "auto" else depth
+    free, depth = depth == "auto", default_depth(depth, cloud.dim)
     disc = discretize(problem, cloud, "S", order, None, stencils, None, depth=depth)
     if free and stencils is not None and _narrowest(stencils) < source_stencil_size(disc.rec, 0):
         disc = discretize(problem, cloud, "S", order, None, stencils, None, depth=0)
@@ -112,6 +112,11 @@ def assemble_pencil(
     layout = Layout(None, made.layout.classes, made.layout.fitness)  # without the cloud, which must not live by it
     kept.keep(disc, nums, massed, replace(made, held_values=None, conditions=None, layout=layout))
     return made
+
+
+def default_depth(depth: int | str, dim: int) -> int:
+    """The depth that is meant by "auto"."""
+    return _DEPTH[dim] if isinstance(depth, str) else depth
 
 
 def _narrowest(stencils: Stencils) -> int:

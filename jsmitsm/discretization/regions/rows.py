@@ -92,7 +92,12 @@ def _slot_values(regions: Regions, name: str, b: Between, taylor: Any) -> Any:
 
 def spread(regions: Regions, values: list[Any], shape: tuple[int, ...]) -> Any:
     """Values of every region's particles as those of the whole cloud."""
-    return _spread(values, [p.ids for p in regions.parts], np.zeros(shape))
+    return spread_values(values, [p.ids for p in regions.parts], shape)
+
+
+def spread_values(values: list[Any], places: list[np.ndarray], shape: tuple[int, ...]) -> Any:
+    """Values of some particles each as those of all."""
+    return _spread(values, places, np.zeros(shape))
 
 
 @in_one_program

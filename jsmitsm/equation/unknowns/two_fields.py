@@ -13,6 +13,8 @@ from jsmitsm.equation.bcs import Condition
 from jsmitsm.equation.field import LocalField
 from jsmitsm.equation.operators import grad
 from jsmitsm.equation.problem import Problem
+from jsmitsm.equation.regions.interface import INTERFACE
+from jsmitsm.equation.regions.per_region import PerRegion
 from jsmitsm.equation.unknowns.parts import parts
 
 I = np.complex128(1j)
@@ -34,12 +36,14 @@ def two_fields(problem: Problem) -> Problem:
 
         return both
 
-    def pde(u: Any, x: Any, *more: Any) -> Any:
-        return split(lambda x, *p: problem.pde(_complex(u), x, *p))(x, *more)
+    def stated(pde: Callable[..., Any]) -> Callable[..., Any]:
+        return lambda u, x, *more: split(lambda x, *p: pde(_complex(u), x, *p))(x, *more)
 
+    given: Any = problem.pde
+    pde = {name: stated(one) for name, one in given.items()} if isinstance(given, PerRegion) else stated(given)
     bcs = {
-        name: [new for c in given for new in _condition(c, problem.fields, split, f"bcs[{name!r}]")]
-        for name, given in problem.bcs.items()
+        name: [new for c in listed for new in _condition(c, problem.fields, split, f"bcs[{name!r}]")]
+        for name, listed in problem.bcs.items()
     }
     return Problem(pde, bcs, 2 * problem.fields, real)
 
@@ -78,6 +82,8 @@ def _condition(c: Condition, fields: int, split: Any, where: str) -> list[Condit
     """The real conditions that a complex one amounts to."""
     if c.kind in ("periodic", "free"):
         return [c]
+    if c.kind == INTERFACE:
+        return [_between(c, fields, split, where)]
     if c.kind == "condition":
 
         def residual(u: Any, x: Any, n: Any, *more: Any) -> Any:
@@ -93,6 +99,29 @@ def _condition(c: Condition, fields: int, split: Any, where: str) -> list[Condit
         return [Condition(c.kind, None, **rest, value=_value(c.value, fields, split))]
     both = (c.field, _part(c.value, 0, split)), (fields + c.field, _part(c.value, 1, split))
     return [Condition(c.kind, f, **rest, value=v) for f, v in both]
+
+
+def _between(c: Condition, fields: int, split: Any, where: str) -> Condition:
+    """The conditions on an interface, of both parts."""
+    parts = dict(c.parts)
+    if "residual" in parts:
+
+        def residual(a: Any, b: Any, x: Any, n: Any, *more: Any) -> Any:
+            return split(lambda x, n, *p: c.residual(_complex(a), _complex(b), x, n, *p))(x, n, *more)
+
+        return Condition(c.kind, residual=residual)
+
+    def flux(given: Any) -> Any:
+        return lambda u, x, n, *more: split(lambda x, n, *p: given(_complex(u), x, n, *p))(x, n, *more)
+
+    if jnp.iscomplexobj(parts.get("resistance")):
+        raise ValueError(f"{where}.resistance: complex, which couples the parts; write it as a residual(a, b, x, n)")
+    for name in ("one", "two"):
+        parts[name] = flux(parts[name])
+    for name in ("jump", "source"):
+        if parts.get(name) is not None:
+            parts[name] = _value(parts[name], fields, split)
+    return Condition(c.kind, **parts)
 
 
 def _robin(c: Condition, fields: int, split: Any, where: str) -> Condition:

@@ -10,6 +10,7 @@ import numpy as np
 
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.cloud.neighbours import nearest
+from jsmitsm.cloud.regions.region_cloud import RegionCloud
 from jsmitsm.discretization.pencil.sparse import Sparse
 from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.taylor.multi_indices import MultiIndex, count, factorial, index_of, multi_indices
@@ -89,3 +90,26 @@ class StateFit:
     def discretization(self) -> Any:
         """There is none: the estimate is the evolution's to make."""
         raise ValueError("error_estimate: a state alone has none; ask the evolution, run.error_estimate()")
+
+
+class RegionsStateFit(StateFit):
+    """The same where there are several regions: each has polynomials of its own."""
+
+    def __init__(self, cloud: RegionCloud, degree: int, make: list[Callable[[], LocalFits] | None] | None = None):
+        super().__init__(cloud, degree)
+        makers = make or [None] * len(cloud.regions)
+        self.parts = [StateFit(cloud.region(n), degree, m) for n, m in zip(cloud.regions, makers)]
+
+    def coefficients(self, values: Any) -> Any:
+        assert isinstance(self.cloud, RegionCloud)
+        values = np.asarray(values)
+        found = [part.coefficients(values[ids]) for part, ids in zip(self.parts, self.cloud.regions.values())]
+        out = np.zeros((*values.shape, found[0].shape[-1]))
+        for ids, own in zip(self.cloud.regions.values(), found):
+            out[ids] = own
+        return out
+
+
+def state_fit(cloud: Cloud, degree: int) -> StateFit:
+    """Of states on any cloud."""
+    return RegionsStateFit(cloud, degree) if isinstance(cloud, RegionCloud) else StateFit(cloud, degree)

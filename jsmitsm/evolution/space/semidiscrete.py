@@ -14,7 +14,7 @@ from jsmitsm.discretization.coefficients import conditions_of
 from jsmitsm.discretization.pencil.assemble import Pencil
 from jsmitsm.discretization.pencil.local import source_stencils
 from jsmitsm.discretization.pencil.sparse import Sparse
-from jsmitsm.evolution.space.local_fits import LocalFits
+from jsmitsm.evolution.space.local_fits import LocalFits, StateFit
 from jsmitsm.evolution.space.system import System
 from jsmitsm.evolution.space.timed import Timed
 from jsmitsm.evolution.steps.tableaux import Sampling
@@ -210,6 +210,10 @@ class Semidiscrete:
             flat = np.zeros(self.n * self.fields)
             flat[self.free], flat[self.held] = part, held
         return flat.reshape(self.n, self.fields)[self.disc.partner]
+
+    def state_fit(self, degree: int) -> StateFit:
+        """What gives a state its local polynomials."""
+        return StateFit(self.disc.cloud, degree, lambda: local_fits(self.disc, degree))
 
     # ------------------------------------------------------------------ the nonlinear part
 

@@ -82,9 +82,9 @@ class Timed:
 def timed(problem: Problem, cloud: Cloud) -> Timed:
     """Record a problem in time; ValueError where it is none."""
     with_params = problem.params is not None
-    pde = _in_time(problem.pde, with_params, (("u, x, t", 3),), "pde", "js.Problem")
+    pde = in_time(problem.pde, with_params, (("u, x, t", 3),), "pde", "js.Problem")
     bcs = {
-        name: [_condition_in_time(c, with_params, f"bcs[{name!r}]") for c in conditions]
+        name: [condition_in_time(c, with_params, f"bcs[{name!r}]") for c in conditions]
         for name, conditions in problem.bcs.items()
     }
     stated = Problem(pde, bcs, problem.fields, (np.asarray(0.0), problem.params))
@@ -110,7 +110,7 @@ def timed(problem: Problem, cloud: Cloud) -> Timed:
     orders = [max((sum(b) for (_, b), p in zip(whole.slots, row) if p), default=-1) for row in whole.pattern]
     problem_in_time = closed(stated, whole)
     problem_in_time.pde = operator  # type: ignore[assignment]
-    condition_moves = _check_conditions(problem_in_time)
+    condition_moves = check_conditions(problem_in_time)
     return Timed(
         problem_in_time, still, rest, tuple(masses),
         not source_moves and not condition_moves,
@@ -151,7 +151,7 @@ def _check_constraints(whole: Traced, fields: int) -> None:
         )
 
 
-def _check_conditions(problem: Problem) -> bool:
+def check_conditions(problem: Problem) -> bool:
     """Whether a condition's value depends on t; ValueError where its form does, or where it is nonlinear."""
     found = False
     for name, conditions in problem.bcs.items():
@@ -172,18 +172,18 @@ def _check_conditions(problem: Problem) -> bool:
     return found
 
 
-def _condition_in_time(c: Condition, with_params: bool, where: str) -> Condition:
+def condition_in_time(c: Condition, with_params: bool, where: str) -> Condition:
     forms = (("u, x, n, t", 4), ("u, x, t", 3)) if c.kind == "condition" else (("x, t", 2), ("x", 1))
 
     def one(name: str, part: Any) -> Any:
-        return _in_time(part, with_params, forms, f"{where}.{name}", c.kind) if callable(part) else part
+        return in_time(part, with_params, forms, f"{where}.{name}", c.kind) if callable(part) else part
 
     return Condition(c.kind, c.field, **{name: one(name, part) for name, part in c.parts.items()})
 
 
-def _in_time(function: Callable[..., Any], with_params: bool, forms: Any, where: str, kind: str) -> Callable[..., Any]:
+def in_time(function: Callable[..., Any], with_params: bool, forms: Any, where: str, kind: str) -> Callable[..., Any]:
     """A user's function of t as one of the parameters (t, params)."""
-    fitting = [names for names, count in forms if _takes(function, count + with_params)]
+    fitting = [names for names, count in forms if _takes(function, count + with_params, names)]
     tail = ", params" if with_params else ""
     if not fitting:
         raise ValueError(
@@ -197,18 +197,28 @@ def _in_time(function: Callable[..., Any], with_params: bool, forms: Any, where:
 
     if names == "u, x, t" and kind == "condition":
         return lambda u, x, n, p: function(u, x, *last(p))
-    if names == "u, x, n, t":
+    if names.startswith("a, b"):
+        return lambda a, b, x, n, p: function(a, b, x, n, *last(p))
+    if names.startswith("u, x, n"):
         return lambda u, x, n, p: function(u, x, n, *last(p))
     if names == "u, x, t":
         return lambda u, x, p: function(u, x, *last(p))
     return lambda x, p: function(x, *last(p))
 
 
-def _takes(function: Callable[..., Any], count: int) -> bool:
+def _takes(function: Callable[..., Any], count: int, names: str) -> bool:
+    """Whether a function takes so many arguments, those of these names.
+
+    Numbers kept in defaults, as in lambda x, c=c: c * x[0], do not take the place of the time.
+    """
     try:
-        inspect.signature(function).bind(*[None] * count)
+        signature = inspect.signature(function)
+        signature.bind(*[None] * count)
     except TypeError:
         return False
     except ValueError:  # a callable without a signature
         return True
-    return True
+    at = len(names.split(", ")) - 1
+    given = list(signature.parameters.values())
+    return not (names.endswith("t") and at < len(given) and given[at].default is not inspect.Parameter.empty
+                and given[at].name not in ("t", "time"))  # fmt: skip

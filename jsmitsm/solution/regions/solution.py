@@ -223,13 +223,15 @@ class RegionsSolution(Solution):
                 'the region, sol(points, region="a")'
             )
         where = located(self.cloud, np.asarray(at))
-        out: Any = jnp.full((len(at), *jnp.shape(self.u)[1:]), jnp.nan)
+        out: Any = None
         for k, name in enumerate(self.cloud.regions):
             here = np.flatnonzero(where == k)
             if len(here):
                 made = self._one(name).derivative(at[here], multi_index, blend=blend, outside=outside)
+                if out is None:
+                    out = jnp.full((len(at), *made.shape[1:]), jnp.nan, made.dtype)
                 out = out.at[here].set(made)
-        return out
+        return jnp.zeros((0, *jnp.shape(self.u)[1:])) if out is None else out
 
     def integral(self, group: str | None = None, *, region: str | None = None) -> jax.Array:
         """The integral of u over the domain or a region, over a boundary group, or over one side of an interface.

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jsmitsm.solution.regions.solution import RegionsSolution
 from jsmitsm.solution.solution import Solution
 
 
@@ -54,3 +55,19 @@ class ComplexSolution(Solution):
 
     def __repr__(self) -> str:
         return f"{super().__repr__()[:-1]}, complex)"
+
+
+@jax.tree_util.register_pytree_node_class
+class ComplexRegionsSolution(ComplexSolution, RegionsSolution):
+    """The same in several regions."""
+
+    derivative = RegionsSolution.derivative  # type: ignore[assignment]
+
+    def region(self, name: str) -> ComplexSolution:
+        """The solution of one region, on its own cloud with outward normals."""
+        return ComplexSolution.of(super().region(name))
+
+
+def complex_solution(real: Solution) -> ComplexSolution:
+    """The complex solution, in one region or several, made of a real one with the two parts of every field."""
+    return (ComplexRegionsSolution if isinstance(real, RegionsSolution) else ComplexSolution).of(real)

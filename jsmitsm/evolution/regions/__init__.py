@@ -1,0 +1,1 @@
+"""Several regions in time: the parts of each region's equation, put together."""

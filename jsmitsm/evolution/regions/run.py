@@ -1,0 +1,63 @@
+"""A run of a problem with several regions before its first step."""
+
+from __future__ import annotations
+
+import time
+from types import SimpleNamespace
+from typing import Any
+
+import jax
+import numpy as np
+
+from jsmitsm.discretization.regions.pencil import assemble_regions_pencil
+from jsmitsm.evolution.regions.semidiscrete import RegionsSemidiscrete
+from jsmitsm.evolution.run import Run
+from jsmitsm.evolution.space.convection import refuse_convection
+
+
+class RegionsRun(Run):
+    """What ``Run`` is to one region; ``timed`` is a ``RegionsTimed``."""
+
+    timed: Any
+    cloud: Any
+
+    def _damping(self, asked: Any) -> float:
+        if not isinstance(asked, str) and asked:
+            raise ValueError("damping: that of waves, which js.evolve does for one region alone; leave it out")
+        return 0.0
+
+    def pencil(self, t: Any, u: Any) -> RegionsSemidiscrete:
+        began = time.perf_counter()
+        massed = np.zeros(self.fields, bool)
+        for part in self.timed.parts.values():
+            for record in (*part.masses, part.rest):
+                massed |= record.pattern.any(axis=1) if record.slots else record.source != "zero"
+        self.counts["pencils"] += 1
+        with jax.ensure_compile_time_eval():
+            semi = self._semidiscrete(t, self.order, massed, self.stencils)
+        if not self.traced:
+            self._refuse_convection()
+        self.told = list(semi.pencil.health)
+        self.counts["seconds in pencils"] = self.counts.get("seconds in pencils", 0.0) + time.perf_counter() - began
+        return semi
+
+    def finer(self) -> RegionsSemidiscrete:
+        return self._semidiscrete(np.asarray(float(self.t[0])), self.order + 2, None, None)
+
+    def _semidiscrete(self, t: Any, order: int, massed: Any, stencils: Any) -> RegionsSemidiscrete:
+        problem = self.timed.at(t, self.params)
+        pencil = assemble_regions_pencil(
+            problem, self.cloud, order=order, mass=massed, stencils=stencils, depth=self.depth
+        )
+        return RegionsSemidiscrete(self.timed, pencil, self.params)
+
+    def _refuse_convection(self) -> None:
+        for name, part in self.timed.parts.items():
+            region = self.cloud.region(name)
+            told: list[str] = []
+            view: Any = SimpleNamespace(timed=part, second=False, points=region.points, fields=self.fields)
+            try:
+                refuse_convection(view, told)
+            except ValueError as error:
+                raise ValueError(f"{error} (in the region {name!r})") from None
+            self.flags += [f"In the region {name!r}: {line[0].lower()}{line[1:]}" for line in told]
