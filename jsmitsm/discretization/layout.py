@@ -105,8 +105,7 @@ class Discretization(Placed):
     @property
     def active(self) -> np.ndarray:
         """The particles that carry equations, ascending."""
-        free = ~self.held.all(axis=1)
-        return np.flatnonzero(free if self.part is None else free & self.part.own)
+        return np.flatnonzero(~self.held.all(axis=1) & (True if self.part is None else self.part.own))
 
 
 def discretize(
@@ -151,17 +150,16 @@ def discretize(
         raise ValueError(
             f"kernel: the derivatives of js.Constant vanish, and method {method} tests with them; use another kernel"
         )
-    given_stencils = stencils is not None
     place = _placed(problem, cloud, kernel, stencils, scheme, groups, part)
     if kernel is None and method in ("I", "II"):
         kernel = default_kernel(cloud.points, np.arange(len(cloud)), place.stencils.indices)
     disc = Discretization(
         problem=problem, cloud=cloud, kernel=kernel, traced=traced, rec=rec, groups=groups, scheme=scheme,
-        given_stencils=given_stencils, basis_terms=basis_terms, part=part, **vars(place),
+        given_stencils=stencils is not None, basis_terms=basis_terms, part=part, **vars(place),
     )  # fmt: skip
-    if given_stencils or kernel is not None:
+    if stencils is not None or kernel is not None:
         check_supports(scheme, disc.stencils, kernel, disc.points, disc.n_own, disc.active)
-    if given_stencils and kernel is not None:
+    if stencils is not None and kernel is not None:
         disc.cut_off = cut_off(disc.stencils, kernel, disc.points, disc.active)
     place.classes = place.classes or sorted_classes(disc, disc.active, disc.stencils)
     disc.classes = list(place.classes)
@@ -268,7 +266,7 @@ def _most_need(counts: np.ndarray, part: Part | None) -> int:
     if part is None:
         return int(np.sort(counts)[4 * (len(counts) - 1) // 5]) if len(counts) else 1
     widest = part.largest({"": int(counts.max(initial=1))})[""]
-    upto = np.cumsum(part.total(np.bincount(counts, minlength=widest + 1)))
+    upto = part.total(np.bincount(counts, minlength=widest + 1)).cumsum()
     return int(np.searchsorted(upto, 4 * (upto[-1] - 1) // 5, side="right"))
 
 

@@ -50,20 +50,20 @@ def error_estimate(sol: ParallelSolution) -> np.ndarray:
         disc = low.disc
         most = room(disc.rec, order, disc.traced, low.cloud, disc.problem.params, low.part)
     high = Local(us, low.problem, low.mine, Settings("S", order, min(disc.rec.depth, most), None, True, "loo"))
-    high_nums, *high_rows = high.rows()
+    high_nums, classes, rows = high.rows()
     values = np.zeros((len(high.halo), sol._recipe.fields))
     values[high.halo.ids] = sol._values[low.halo.ids]
     values = high.halo.spread(values)
-    nums, *rows = low.rows()
+    nums, low_classes, low_rows = low.rows()
     with us.phase():
-        defect, theirs = _defects(high, high_nums, *high_rows, values)
-        _, mine = _defects(low, nums, *rows, sol._values)
+        defect, theirs = _defects(high, high_nums, classes, rows, values)
+        _, mine = _defects(low, nums, low_classes, low_rows, sol._values)
         disc, own = low.disc, low.halo.ids
         ratio = np.ones(disc.held.shape)
         there = np.ones(disc.held.shape)
         ratio[own], there[own] = mine[own], theirs[high.halo.ids]
         scale = one_scale(ratio, there, disc, low.halo.own, lambda x: _median(us, x))
-        trusted = trust_of(high.disc, *high_rows)[high.halo.ids]
+        trusted = trust_of(high.disc, classes, rows)[high.halo.ids]
         weighed = scale[own] * trusted * defect[high.halo.ids]
     x = sol.system.solve(weighed[~disc.held[own]])
     out = np.zeros(weighed.shape)

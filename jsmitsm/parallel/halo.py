@@ -25,12 +25,11 @@ class Halo:
         ]
         rows = team.trade([mine.columns(at) for at in near])
         self.slab = mine.of_rows(np.concatenate([mine.columns(slice(None)), *rows]))
-        place = lambda number: np.searchsorted(self.slab.number, number)  # noqa: E731
-        self.ids = place(mine.number)
+        self.ids: np.ndarray = np.searchsorted(self.slab.number, mine.number)
         self.own = np.zeros(len(self.slab), bool)
         self.own[self.ids] = True
         self.lent = [self.ids[at] for at in near]
-        self.borrowed = [place(some[:, 0].astype(int)) for some in rows]
+        self.borrowed = [np.searchsorted(self.slab.number, some[:, 0].astype(int)) for some in rows]
 
     def __len__(self) -> int:
         return len(self.slab)

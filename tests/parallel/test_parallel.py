@@ -89,7 +89,8 @@ def test_files(found):
 @pytest.mark.parametrize(
     "what, words",
     [
-        ("floating", "nothing fixes"), ("nonlinear", "nonlinear"), ("II", "'II' is none of"), ("periodic", "periodic"),
+        ("floating", "nothing fixes"), ("nonlinear", "nonlinear"), ("II", "'II' is none of"),
+        ("periodic", "js.periodic is not made"),
         ("first order", "information travels"), ("one process", "on process 0"), ("array", "shape (3,)"),
     ],
 )  # fmt: skip
