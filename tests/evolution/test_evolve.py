@@ -439,17 +439,9 @@ def incompressible(u, x, t):
     return jnp.stack([*(js.dt(u[k])(x) - js.laplacian(u[k])(x) + p[k] for k in range(2)), v[0] + w[1]])
 
 
-def layers():
-    cloud = js.regions({"a": (0.0, 0.5), "b": (0.5, 1.0)}, spacing=0.1)
-    return js.evolve(js.Problem({"a": COOLING.pde, "b": COOLING.pde}, {"a|b": js.interface(flux={
-        "a": lambda u, x, n: n @ js.grad(u)(x), "b": lambda u, x, n: n @ js.grad(u)(x)}),
-        "boundary": js.dirichlet(0.0)}), cloud, 1.0, (0.0, 1.0), steps=4)  # fmt: skip
-
-
 @pytest.mark.parametrize(("call", "words"), [
     (lambda: js.evolve(js.Problem(incompressible, everywhere(SQUARE, [js.dirichlet(0.0, field=0), js.dirichlet(
         0.0, field=1)]), fields=3), SQUARE, 0.0, (0.0, 1.0), steps=4), "pde: field 2 has no rate"),
-    (layers, "js.evolve does problems of one region"),
     (lambda: evolved(steps=3, tol=1e-3), "steps, tol: give exactly one"),
     (lambda: evolved(order=4), "steps, tol: give exactly one"),
     (lambda: evolved(steps=0), "steps: expected a whole number from 1"),
