@@ -29,6 +29,7 @@ SYMPTOMS = {
     "Between the particles the equation is missed": "missed",
     "The estimated error is": "estimate",
     "No order reaches the tolerance": "tolerance",
+    "The data may not balance": "balance",
     "where regions meet": "meeting",
     "The estimated error in time": "time",
     "Between neighbouring particles convection": "drift",

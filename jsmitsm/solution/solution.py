@@ -280,7 +280,7 @@ class Solution(Anywhere):
         if not bool(self.converged):
             lines.append("The solve did NOT converge; do not trust these values.")
         told = s.get("messages", [])
-        lines += [f"FLAG: {line}" for line in self.flags if line not in told]
+        lines += [f"FLAG: {line}" for line in self.flags if not any(line.startswith(one) for one in told)]
         lines += [str(line) for line in told]
         if self._error is not None:
             lines.append(f"The estimated error is {self._share:.1e} of the solution.")
