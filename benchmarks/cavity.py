@@ -32,6 +32,8 @@ DATA = Path(__file__).parent / "data" / "cavity.json"
 # Least u on x = 1/2, largest and least v on y = 1/2.
 CHEBYSHEV = (-0.163369, 0.139291, -0.195346)
 GHIA = {100: (-0.21090, 0.17527, -0.24533), 400: (-0.32726, 0.30203, -0.44993), 1000: (-0.38289, 0.37095, -0.51550)}
+# On clouds this coarse order 4 is up to 40 % off, and with a deeper recursion Newton's steps do not arrive.
+HOW: dict[str, Any] = {"order": 6, "depth": 0}
 BOTELLA = (-0.3885698, 0.3769447, -0.5270771)
 
 
@@ -87,10 +89,9 @@ def line(what: str, sol: js.Solution, known: tuple[float, ...], began: float) ->
 
 
 def smooth(quick: bool) -> Iterator[dict[str, Any]]:
-    for n in (13, 17) if quick else (13, 17, 21, 31):
-        began = time.process_time()
-        sol = js.solve(problem(smooth_lid, 100.0), js.rectangle((0.0, 0.0), (1.0, 1.0), (n, n), jitter=0.2))
-        yield line("smooth lid, Re 100", sol, CHEBYSHEV, began)
+    for n in (13, 17) if quick else (13, 17, 21, 27):
+        began, cloud = time.process_time(), js.rectangle((0.0, 0.0), (1.0, 1.0), (n, n), jitter=0.2)
+        yield line("smooth lid, Re 100", js.solve(problem(smooth_lid, 100.0), cloud, **HOW), CHEBYSHEV, began)
 
 
 def singular(quick: bool) -> Iterator[dict[str, Any]]:
@@ -99,7 +100,9 @@ def singular(quick: bool) -> Iterator[dict[str, Any]]:
         for reynolds in (100, 400, 1000):
             began = time.process_time()
             # The last one starts from the one before.
-            sol = js.solve(problem(1.0, reynolds), cloud, u0=before if reynolds == 1000 else None, throw=False)
+            sol = js.solve(
+                problem(1.0, reynolds), cloud, u0=before if reynolds == 1000 else None, throw=False, **HOW
+            )  # fmt: skip
             before = sol.u
             if bool(sol.converged):
                 yield line(f"lid, Re {reynolds}", sol, GHIA[reynolds], began)
@@ -119,7 +122,7 @@ def table(parts: dict[str, list[dict[str, Any]]]) -> dict[str, Any]:
         for part in parts.values() for r in part
     ]  # fmt: skip
     note = (
-        "`python -m benchmarks.cavity`, order 4: extremes of the velocities on the centre lines, and by how much they "
+        "`python -m benchmarks.cavity`, order 6, depth 0: extremes of the velocities on the centre lines, and by how much they "
         "differ from those of a Chebyshev collocation (smooth lid), of Ghia, Ghia and Shin (1982), and of Botella and "
         "Peyret (1998) where it says so."
     )
