@@ -14,7 +14,7 @@ from jsmitsm.discretization.layout import Class, Discretization
 from jsmitsm.discretization.supports import default_kernel
 from jsmitsm.particle import batches
 from jsmitsm.particle.batches import Operands
-from jsmitsm.particle.elimination import Elimination, Scheme, eliminate, eliminate_on_host
+from jsmitsm.particle.elimination import Elimination, Scheme, as_matrix, eliminate, eliminate_on_host
 from jsmitsm.particle.kernels import Kernel
 from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.runtime.whole_program import in_one_program
@@ -105,7 +105,8 @@ def shared_elimination(disc: Discretization, nums: Numbers) -> Elimination | Non
 
 @partial(in_one_program, static=("scheme",))
 def _eliminate(scheme: Scheme, jac: Any) -> Elimination:
-    return eliminate(scheme, jac, 1.0)
+    made = eliminate(scheme, jac, 1.0)
+    return made._replace(particular=as_matrix(made.particular))
 
 
 def right_sides(disc: Discretization, nums: Numbers, cls: Class) -> tuple[Any, Any]:

@@ -165,6 +165,11 @@ def transposed(particular: Any, wanted: Any) -> Any:
     return particular.transposed(wanted) if isinstance(particular, Deep) else particular.T @ wanted
 
 
+def as_matrix(particular: Any) -> Any:
+    """Particular solutions (F K, rows) in one piece, for an elimination that many particles share."""
+    return particular @ jnp.eye(particular.shape[1]) if isinstance(particular, Deep) else particular
+
+
 def _deepened(scheme: Scheme, matrix: Any, basis: Any, particular: Any) -> tuple[Any, Deep]:
     """Local solutions (F K, free) of all degrees, from those of the fit's, and the particular ones."""
     place = fit_and_tail(scheme.rec)
