@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import json
 import time
+from argparse import Namespace
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -132,8 +133,7 @@ def table(parts: dict[str, list[dict[str, Any]]]) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def main() -> None:
-    given = arguments(__doc__, "quick", names="part")
+def main(given: Namespace) -> None:
     old = json.loads(DATA.read_text()) if DATA.exists() else {"parts": {}}
     for name in given.names or PARTS:
         rows = old["parts"][name] = []
@@ -144,4 +144,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    main(arguments(__doc__, "quick", names="part"))

@@ -10,7 +10,7 @@ from benchmarks.commandline import arguments
 
 EXAMPLES = sorted((Path(__file__).parent.parent / "docs" / "gallery").glob("*.py"))
 # These take most of a minute to compile: run with the pictures, not with the tests.
-SLOW = {"inverse", "kovasznay"}
+SLOW = {"inverse", "kovasznay", "torus", "colloid"}
 
 
 def run(path):

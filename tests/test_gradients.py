@@ -131,9 +131,10 @@ def check_every_derivative(case, method, solver):
         assert abs(measured) > 1e-7, f"{name} does not move the objective: nothing was tested"
 
 
-@pytest.mark.parametrize("method, solver", [(m, "sparse") for m in mm.METHODS] + [("S", "dense"), ("III", "dense")])
+@pytest.mark.parametrize("method", ["S", "III", "SSPH"])
+@pytest.mark.parametrize("solver", ["dense", "sparse"])
 def test_every_derivative_in_1d(line, method, solver):
-    """Dense gradients of the other methods are below, of all their outputs."""
+    """Gradients of all outputs of I and II, whose programs take longest to compile, are below."""
     check_every_derivative(line, method, solver)
 
 
@@ -175,12 +176,6 @@ def test_one_smoothing_length_per_particle(line):
 def test_jit_returns_the_same(line, solver):
     f = lambda t: line.u(t, "S", solver)
     assert np.allclose(jax.jit(f)(line.theta), f(line.theta), rtol=0, atol=1e-11)
-
-
-def test_jit_of_grad_returns_the_same(line):
-    plain, compiled = jax.grad(line.objective)(line.theta), jax.jit(jax.grad(line.objective))(line.theta)
-    for name in NAMES:
-        assert np.allclose(compiled[name], plain[name], rtol=1e-8, atol=1e-8), name
 
 
 def test_vmap_over_numbers_returns_the_same(line):
