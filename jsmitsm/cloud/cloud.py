@@ -114,21 +114,6 @@ class Cloud:
         made_again = ("_inside", "_kept", "_shape")  # when needed, or looked at by pictures alone
         return {name: value for name, value in self.__dict__.items() if name not in made_again}
 
-    def kept(self, question: Hashable, answer: Callable[[], Any]) -> Any:
-        """What ``answer()`` gives, or gave when it was last asked: it may rest on the question and on this cloud alone.
-
-        The next solve on a cloud finds neighbours, supports and classes as they were. It must not change what it gets.
-        """
-        if len(self) > _LARGEST_KEPT or is_traced(self.points, self.normals):
-            return answer()
-        kept = self.__dict__.setdefault("_kept", {})
-        found = kept.pop(question, None)
-        found = answer() if found is None else found
-        kept[question] = found  # the last one used stands last
-        while len(kept) > _MOST_KEPT:
-            kept.pop(next(iter(kept)), None)
-        return found
-
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update({name: frozen(value) for name, value in state.items()})
 
@@ -363,3 +348,19 @@ def checked_normals(normals: Any, points: Any, groups: Groups) -> Any:
 
 def _describe_groups(groups: Any) -> str:
     return f"keys {list(groups)}" if isinstance(groups, Mapping) else type(groups).__name__
+
+
+def kept(cloud: Cloud, question: Hashable, answer: Callable[[], Any]) -> Any:
+    """What ``answer()`` gives, or gave when it was last asked: it may rest on the question and on the cloud alone.
+
+    The next solve on a cloud finds neighbours, supports and classes as they were. It must not change what it gets.
+    """
+    if len(cloud) > _LARGEST_KEPT or is_traced(cloud.points, cloud.normals):
+        return answer()
+    answers = cloud.__dict__.setdefault("_kept", {})
+    found = answers.pop(question, None)
+    found = answer() if found is None else found
+    answers[question] = found  # the last one used stands last
+    while len(answers) > _MOST_KEPT:
+        answers.pop(next(iter(answers)), None)
+    return found

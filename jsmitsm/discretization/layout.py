@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from jsmitsm.cloud.cloud import Cloud
+from jsmitsm.cloud.cloud import Cloud, kept
 from jsmitsm.cloud.neighbours import Stencils
 from jsmitsm.cloud.regions.region_cloud import RegionCloud
 from jsmitsm.cloud.walls import Walls, seen
@@ -204,7 +204,7 @@ def _placed(
     if is_traced(given) or (stencils is None and kernel is not None) or sum(x.nbytes for x in given) > _LARGE:
         return place()
     numbers = tuple((x.shape, x.dtype.str, x.tobytes()) for x in map(np.asarray, given))
-    return cloud.kept((scheme, conditions, pairs, numbers), place)
+    return kept(cloud, (scheme, conditions, pairs, numbers), place)
 
 
 def mean_spacing(disc: Discretization) -> float:

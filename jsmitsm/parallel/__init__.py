@@ -10,7 +10,7 @@ from jsmitsm.parallel.estimate import error_estimate
 from jsmitsm.parallel.files import save
 from jsmitsm.parallel.gradient import value_and_grad
 from jsmitsm.parallel.solution import ParallelSolution, evaluate, norm
-from jsmitsm.parallel.solve import solve
+from jsmitsm.parallel.solving import solve
 
 __all__ = [
     "ParallelCloud", "ParallelSolution", "error_estimate", "evaluate", "norm", "read", "save", "solve",

@@ -18,7 +18,7 @@ from jsmitsm.discretization.rows import all_rows
 from jsmitsm.equation.problem import Problem
 from jsmitsm.parallel.distributed import ParallelCloud
 from jsmitsm.parallel.local import Local, local_kernel, local_problem
-from jsmitsm.parallel.solve import numbered, solve
+from jsmitsm.parallel.solving import numbered, solve
 
 WRT = ("params", "points")
 
