@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from jsmitsm.equation.bcs import Condition
-from jsmitsm.equation.problem import Problem
+from jsmitsm.equation.problem import Problem, of_parts
 from jsmitsm.equation.traced import Traced
 from jsmitsm.equation.tracing import trace
 from jsmitsm.runtime.errors import IN_FUNCTIONS, in_words
@@ -30,14 +30,11 @@ def closed(problem: Problem, traced: Traced) -> Problem:
 
 def with_recorded(problem: Problem, pde: Any, dim: int) -> Problem:
     """The problem with the record ``pde`` (of every region, where there are several) and its conditions recorded."""
-    new = object.__new__(Problem)
-    new.fields, new.params = problem.fields, jax.tree.map(owned, problem.params)
-    new.pde = pde
-    new.bcs = {
+    bcs = {
         name: [_closed_condition(problem, c, dim, f"bcs[{name!r}]") for c in conditions]
         for name, conditions in problem.bcs.items()
     }
-    return new
+    return of_parts(pde, bcs, problem.fields, jax.tree.map(owned, problem.params))
 
 
 def _closed_condition(problem: Problem, c: Condition, dim: int, where: str) -> Condition:

@@ -176,6 +176,13 @@ class Problem:
         return notebooks.shown("Problem", rows)
 
 
+def of_parts(pde: Any, bcs: Any, fields: int, params: Any) -> Problem:
+    """A problem of parts that were judged when a user stated them, and recorded ones among them; without extras."""
+    new = object.__new__(Problem)
+    new.pde, new.bcs, new.fields, new.params = pde, bcs, fields, params
+    return new
+
+
 def _check_params(params: Any, complex_too: bool) -> None:
     """Parameters are finite numbers; traced ones pass."""
     kinds = "biufc" if complex_too else "biuf"

@@ -21,12 +21,13 @@ from jsmitsm.runtime.progress import bar
 from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.solution.arguments import Depth, Formulation, Method, check, discretized, of_regions
 from jsmitsm.solution.fit import Fit, Recipe
+from jsmitsm.solution.kept_matrix import KeptMatrix, refuse_other
 from jsmitsm.solution.regions.factorization import RegionsFactorization
 from jsmitsm.solution.run import Run
 from jsmitsm.solution.solution import Solution
 
 
-class Factorization:
+class Factorization(KeptMatrix):
     """A problem ready to be solved again; made by ``js.factorize``.
 
     It keeps the neighbours, the rows and the factors as long as only the source and the values in the
@@ -47,9 +48,8 @@ class Factorization:
         self._run = Run(disc, problem, solver, True, repair, formulation)
         self._nums = numbers(disc, problem)
         self._parts: list[Any] = []  # of the least-squares form
-        data, rows, cols, self._right = self._run.assembled(self._nums, self._parts)
-        self._matrix = data, rows, cols
-        self._factor: Any = None  # kept as long as this is, whatever else is solved
+        *matrix, self._right = self._run.assembled(self._nums, self._parts)
+        super().__init__(tuple(matrix))
 
     @bar("solve")
     def solve(self, problem: Problem) -> Solution:
@@ -90,10 +90,7 @@ class Factorization:
             depth=old.rec.depth,
         )
         if disc.scheme != old.scheme or not np.array_equal(disc.held, old.held):
-            raise ValueError(
-                "problem: its operator or the kind of its conditions differs from the one that was factorised; "
-                "call js.factorize again"
-            )
+            refuse_other()
         problem = disc.problem
         nums = numbers(disc, problem)
         same = _same(nums.jac, self._nums.jac) and _same(nums.own, self._nums.own) and _same(nums.data, self._nums.data)
@@ -112,9 +109,7 @@ class Factorization:
         disc = self._disc
         run = copy(self._run)  # the solution's own: what it says of itself must not change with the next
         run.problem, run.messages, run.against = problem, list(run.messages), list(run.against)
-        x, good = run.solved(*self._matrix, right)
-        if self._factor is None and not is_traced(self._matrix, x):
-            self._factor = run.factor_of(*self._matrix)
+        x, good = self._solved(run, right)
         values = with_held(disc, nums, x)
         traced = is_traced(values)
         if not traced:
@@ -127,11 +122,6 @@ class Factorization:
         fit = Fit(problem, disc.cloud, disc.kernel, table(disc), None, recipe)
         fine = jnp.isfinite(values).all() if traced else good
         return Solution(values, disc.cloud, recipe, fit, fine, 1, run.stats(), report=None if traced else run)
-
-    def __reduce__(self):
-        raise TypeError(
-            "a Factorization is not pickled, nor copied: keep the problem and the cloud, and call js.factorize again"
-        )
 
     def __repr__(self) -> str:
         return f"Factorization({int((~self._disc.held).sum())} unknowns, method={self._disc.scheme.method!r})"

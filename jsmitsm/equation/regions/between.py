@@ -11,7 +11,7 @@ import numpy as np
 
 from jsmitsm.equation.bcs import Condition
 from jsmitsm.equation.conditions import component
-from jsmitsm.equation.problem import Problem
+from jsmitsm.equation.problem import Problem, of_parts
 from jsmitsm.equation.regions.interface import INTERFACE
 from jsmitsm.equation.traced import Traced
 from jsmitsm.runtime.errors import did_you_mean
@@ -44,9 +44,7 @@ def region_of(problem: Problem, cloud: Any, name: str) -> Problem:
     ids = cloud.regions[name]
     place = np.full(len(cloud), -1)
     place[ids] = np.arange(len(ids))
-    new = object.__new__(Problem)
-    new.fields, new.params, new.pde = problem.fields, problem.params, problem.pde[name]
-    new.bcs = {}
+    new = of_parts(problem.pde[name], {}, problem.fields, problem.params)
     for group, conditions in problem.bcs.items():
         members = cloud.groups.get(group, np.zeros(0, int))
         here = place[members] >= 0

@@ -9,7 +9,7 @@ from typing import Any
 import jax.numpy as jnp
 
 from jsmitsm.equation.bcs import Condition
-from jsmitsm.equation.problem import Problem
+from jsmitsm.equation.problem import Problem, of_parts
 
 
 def stated(problem: Problem, unknowns: Any) -> Problem:
@@ -33,10 +33,7 @@ def at(plain: Problem, unknowns: Any) -> Problem:
     """A problem of ``stated`` (recorded or not) with other unknowns."""
     if not unknowns:
         return plain
-    leaves = plain.bcs, (plain.params[0], floats(unknowns))
-    new = object.__new__(Problem)
-    new.pde, new.fields, (new.bcs, new.params) = plain.pde, plain.fields, leaves
-    return new
+    return of_parts(plain.pde, plain.bcs, plain.fields, (plain.params[0], floats(unknowns)))
 
 
 def floats(unknowns: Any) -> dict[str, Any]:

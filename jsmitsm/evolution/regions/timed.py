@@ -11,11 +11,11 @@ from jsmitsm.cloud.regions.region_cloud import RegionCloud
 from jsmitsm.discretization.regions.rows import spread_values
 from jsmitsm.equation.bcs import Condition
 from jsmitsm.equation.closing import with_recorded
-from jsmitsm.equation.problem import Problem
+from jsmitsm.equation.problem import Problem, of_parts
 from jsmitsm.equation.regions.between import check_regions, region_of
 from jsmitsm.equation.regions.interface import INTERFACE
 from jsmitsm.equation.regions.per_region import PerRegion
-from jsmitsm.evolution.space.timed import Timed, check_conditions, condition_in_time, in_time, timed
+from jsmitsm.evolution.space.timed import Timed, at_moment, check_conditions, condition_in_time, in_time, timed
 
 _VALUES = ("jump", "source", "resistance")
 
@@ -45,10 +45,7 @@ class RegionsTimed:
 
     def at(self, t: Any, params: Any = None) -> Problem:
         """The closed problem at a moment; params: others than its own."""
-        new = object.__new__(Problem)
-        new.__dict__.update(self.problem.__dict__)
-        new.params = (t, self.problem.params[1] if params is None else params)
-        return new
+        return at_moment(self.problem, t, params)
 
     def mass(self, order: int, points: Any, params: Any) -> Any:
         """Coefficients (N, E, F) of the rates of this order."""
@@ -76,9 +73,7 @@ def regions_timed(problem: Problem, cloud: RegionCloud) -> RegionsTimed:
         for name, conditions in problem.bcs.items()
     }
     operators = PerRegion({name: part.operator for name, part in parts.items()})
-    whole = object.__new__(Problem)
-    whole.pde, whole.bcs, whole.fields = operators, bcs, problem.fields
-    whole.params = (np.asarray(0.0), problem.params)
+    whole = of_parts(operators, bcs, problem.fields, (np.asarray(0.0), problem.params))
     closed = with_recorded(whole, operators, cloud.dim)
     moves = check_conditions(closed)
     steady = not moves and all(part.steady for part in parts.values())

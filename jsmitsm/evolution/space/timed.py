@@ -21,7 +21,7 @@ from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.equation.bcs import Condition
 from jsmitsm.equation.closing import closed
 from jsmitsm.equation.field import RATE
-from jsmitsm.equation.problem import Problem
+from jsmitsm.equation.problem import Problem, of_parts
 from jsmitsm.equation.traced import Traced
 from jsmitsm.equation.tracing import moving, restricted, trace
 from jsmitsm.runtime.collector import uncollected
@@ -61,10 +61,7 @@ class Timed:
 
     def at(self, t: Any, params: Any = None) -> Problem:
         """The closed problem at a moment; params: others than its own."""
-        new = object.__new__(Problem)
-        new.__dict__.update(self.problem.__dict__)
-        new.params = (t, self.problem.params[1] if params is None else params)
-        return new
+        return at_moment(self.problem, t, params)
 
     def mass(self, order: int, points: Any, params: Any) -> Any:
         """Coefficients (N, E, F) of the rates of this order."""
@@ -77,6 +74,11 @@ class Timed:
             for s, (k, _) in enumerate(record.slots):
                 columns[k % RATE] = xp.broadcast_to(jac[:, s, 0], (fields, n)).T
         return (jnp if is_traced(columns) else np).stack(columns, axis=2)
+
+
+def at_moment(problem: Problem, t: Any, params: Any) -> Problem:
+    """A closed problem of the parameters (t, params) at a moment; params: None for its own."""
+    return of_parts(problem.pde, problem.bcs, problem.fields, (t, problem.params[1] if params is None else params))
 
 
 def timed(problem: Problem, cloud: Cloud) -> Timed:

@@ -13,12 +13,13 @@ from jsmitsm.discretization.regions.layout import discretize_regions
 from jsmitsm.discretization.regions.rows import RegionNumbers, region_numbers, whole_right_side, whole_table
 from jsmitsm.runtime.progress import bar
 from jsmitsm.runtime.tracers import is_traced
+from jsmitsm.solution.kept_matrix import KeptMatrix, refuse_other
 from jsmitsm.solution.regions.run import RegionsRun
 from jsmitsm.solution.regions.solution import RegionsSolution
 from jsmitsm.solution.regions.solve import finished_regions, prepared_regions
 
 
-class RegionsFactorization:
+class RegionsFactorization(KeptMatrix):
     """What ``js.Factorization`` is to one region: rows and factors kept while sources and conditions' values change.
 
     Examples
@@ -42,9 +43,7 @@ class RegionsFactorization:
         if not self._run.disc.linear:
             raise ValueError("problem: it is nonlinear, so its matrix changes in every step; use js.solve")
         self._nums = self._run.numbers()
-        data, rows, cols, self._right = self._run.assembled(self._nums)
-        self._matrix = data, rows, cols
-        self._factor: Any = None  # kept as long as this is, whatever else is solved
+        super().__init__(self._run.assembled(self._nums)[:3])
 
     @bar("solve")
     def solve(self, problem: Any) -> RegionsSolution:
@@ -72,10 +71,7 @@ class RegionsFactorization:
         if not np.array_equal(disc.held, old.held) or [p.disc.scheme for p in disc.parts] != [
             p.disc.scheme for p in old.parts
         ]:
-            raise ValueError(
-                "problem: its operator or the kind of its conditions differs from the one that was factorised; "
-                "call js.factorize again"
-            )
+            refuse_other()
         nums = region_numbers(disc)
         if not _same_matrix(nums, self._nums):
             return RegionsFactorization(problem, old.cloud, **self._options).solve(problem)
@@ -86,19 +82,12 @@ class RegionsFactorization:
 
     def _finish(self, run: RegionsRun, nums: RegionNumbers) -> RegionsSolution:
         right = whole_right_side(self._run.disc, nums, run.parts, run.bound)
-        x, good = run.solved(*self._matrix, right)
-        if self._factor is None and not is_traced(self._matrix, x):
-            self._factor = run.factor_of(*self._matrix)
+        x, good = self._solved(run, right)
         values = with_held(run.disc, nums, x)  # type: ignore[arg-type]
         if not is_traced(values):
             run.nums, run.values = nums, np.asarray(values)
             good = bool(good) and bool(np.isfinite(run.values).all())
         return finished_regions(run, values, None, good, 1)
-
-    def __reduce__(self):
-        raise TypeError(
-            "a Factorization is not pickled, nor copied: keep the problem and the cloud, and call js.factorize again"
-        )
 
     def __repr__(self) -> str:
         disc = self._run.disc
