@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -55,8 +55,8 @@ def check_crossings(loops: list[np.ndarray], names: list[str]) -> None:
     a = np.concatenate(loops)
     b = np.concatenate([np.roll(loop, -1, axis=0) for loop in loops])
     owner = np.repeat(np.arange(len(loops)), [len(loop) for loop in loops])
-    number = np.concatenate([np.arange(len(loop)) for loop in loops])
-    after = np.concatenate([np.roll(np.arange(len(loop)), -1) for loop in loops])
+    number = np.split(np.arange(len(a)), np.cumsum([len(loop) for loop in loops])[:-1])
+    after = np.concatenate([np.roll(own, -1) for own in number])
 
     def side(p, q, r):  # which side of pq is r on; zero within round-off
         u, v = q - p, r - p
@@ -64,24 +64,36 @@ def check_crossings(loops: list[np.ndarray], names: list[str]) -> None:
         noise = 1e-12 * np.linalg.norm(u, axis=-1) * np.maximum(np.linalg.norm(v, axis=-1), np.linalg.norm(u, axis=-1))
         return np.where(np.abs(turn) <= noise, 0.0, np.sign(turn))
 
-    for i in range(len(a) - 1):
-        p, q, c, d = a[i], b[i], a[i + 1 :], b[i + 1 :]
-        boxes = (np.maximum(c, d) >= np.minimum(p, q)).all(axis=1) & (np.minimum(c, d) <= np.maximum(p, q)).all(axis=1)
-        j = np.flatnonzero(boxes) + i + 1
-        c, d = a[j], b[j]
-        meet = (side(p, q, c) * side(p, q, d) <= 0) & (side(c, d, p) * side(c, d, q) <= 0)
-        follows = (owner[j] == owner[i]) & ((after[i] == number[j]) | (after[j] == number[i]))
+    bad = []
+    for i, j in _close_edges(np.minimum(a, b), np.maximum(a, b)):
+        p, q, c, d = a[i], b[i], a[j], b[j]
+        here, there = side(p, q, c), side(p, q, d)
+        meet = (here * there <= 0) & (side(c, d, p) * side(c, d, q) <= 0)
         # Neighbours meet at their vertex; they overlap only where one folds back onto the other.
-        folded = (side(p, q, c) == 0) & (side(p, q, d) == 0) & ((d - c) @ (q - p) < 0)
-        bad = j[meet & (~follows | folded)]
-        if len(bad):
-            k = bad[0]
-            one, two = names[owner[i]], names[owner[k]]
-            what = f"{one}: crosses or touches itself" if one == two else f"{two}: crosses or touches {one}"
-            raise ValueError(
-                f"{what}, the edge from {a[i]} to {b[i]} meets the one from {a[k]} to {b[k]}; "
-                "reorder or move the vertices (polygons that meet must be joined into one)"
-            )
+        folded = (here == 0) & (there == 0) & (((d - c) * (q - p)).sum(axis=1) < 0)
+        wrong = meet & ((after[i] != j) & (after[j] != i) | folded)
+        bad += zip(i[wrong], j[wrong])
+    if bad:
+        i, k = min(bad)
+        one, two = names[owner[i]], names[owner[k]]
+        what = f"{one}: crosses or touches itself" if one == two else f"{two}: crosses or touches {one}"
+        raise ValueError(
+            f"{what}, the edge from {a[i]} to {b[i]} meets the one from {a[k]} to {b[k]}; "
+            "reorder or move the vertices (polygons that meet must be joined into one)"
+        )
+
+
+def _close_edges(low: np.ndarray, high: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Pairs i < j of edges whose boxes (E, 2) meet, some at a time: a sweep along the first axis."""
+    order = np.argsort(low[:, 0])
+    place = np.arange(len(order))
+    count = np.searchsorted(low[order, 0], high[order, 0], side="right") - place - 1
+    for some in np.array_split(place, 1 + count.sum() // 1_000_000):
+        one = np.repeat(some, count[some])
+        two = one + 1 + np.arange(len(one)) - np.repeat(np.cumsum(count[some]) - count[some], count[some])
+        i, j = order[one], order[two]
+        meet = (low[j, 1] <= high[i, 1]) & (low[i, 1] <= high[j, 1])
+        yield np.minimum(i, j)[meet], np.maximum(i, j)[meet]
 
 
 def check_nesting(loops: list[np.ndarray], names: list[str]) -> None:

@@ -189,21 +189,3 @@ def cut(points: np.ndarray, cells: np.ndarray, axis: int, position: float) -> tu
     low, high = height[edges].T
     share = (low / (low - high))[:, None]
     return place.reshape(-1, 3), points[edges[:, 0]] * (1 - share) + points[edges[:, 1]] * share, edges
-
-
-def refined(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Every triangle cut into four at the middles of its sides; the given points stay in front.
-
-    >>> points, triangles = refined(np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]), np.array([[0, 1, 2]]))
-    >>> len(points), len(triangles)
-    (6, 4)
-    """
-    sides = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    edges, place = np.unique(sides, axis=0, return_inverse=True)
-    a, b, c = triangles.T
-    ab, bc, ca = (len(points) + place.reshape(-1, 3)).T
-    parts = ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))
-    return (
-        np.concatenate([points, points[edges].mean(axis=1)]),
-        np.concatenate([np.stack(part, axis=1) for part in parts]),
-    )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
@@ -10,7 +11,7 @@ import numpy as np
 
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.cloud.regions.region_cloud import RegionCloud
-from jsmitsm.cloud.triangulation import cut, refined, simplices
+from jsmitsm.cloud.triangulation import cut, simplices
 
 AXES = "xyz"
 # Contours are refined by the local polynomials until they have this many triangles.
@@ -62,12 +63,20 @@ def _piece(cloud: Cloud, numbers: np.ndarray, anywhere: Callable | None, axis: i
     else:
         places, cells = points, simplices(cloud)
     given = len(points) if axis < 0 else 0
-    while len(cells) < _FINE:
-        places, cells = refined(places, cells)
+    places, cells = _refined(places, cells)
     there = places if axis < 0 else np.insert(places, axis, position, axis=1)
     # The particles keep the values that were solved for, held ones among them.
     fine = np.asarray(anywhere(there[given:]))
     return Piece(places, cells, np.concatenate([numbers, fine]) if given else fine, loops)
+
+
+def _refined(places: np.ndarray, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Triangles cut into four at the middles of their sides until there are enough; the given places stay in front."""
+    from matplotlib.tri import Triangulation, UniformTriRefiner
+
+    times = max(0, math.ceil(math.log(_FINE / len(cells), 4)))
+    finer: Any = UniformTriRefiner(Triangulation(*places.T, cells)).refine_triangulation(subdiv=times)
+    return np.stack([finer.x, finer.y], axis=1), finer.triangles
 
 
 def _cut(cloud: Cloud, points: np.ndarray, numbers: np.ndarray, axis: int, position: float) -> tuple:

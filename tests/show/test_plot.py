@@ -11,7 +11,7 @@ import pytest
 import jsmitsm as js
 from jsmitsm import plot, sdf
 from jsmitsm.cloud.shapes import from_polygon, from_sdf
-from jsmitsm.cloud.triangulation import cut, refined, simplices
+from jsmitsm.cloud.triangulation import cut, simplices
 
 matplotlib = pytest.importorskip("matplotlib")
 matplotlib.use("Agg")
@@ -74,8 +74,6 @@ def test_a_cut_covers_the_section_and_lies_in_its_plane(position):
     cells, points, edges = cut(box.points, simplices(box), 0, position)
     np.testing.assert_allclose(points[:, 0], position, atol=1e-6)  # a plane through particles is shifted by 1e-7
     assert abs(measure(points[:, 1:], cells) - 6.0) < 1e-5
-    fine, quarters = refined(points, cells)
-    assert len(quarters) == 4 * len(cells) and abs(measure(fine[:, 1:], quarters) - 6.0) < 1e-5
 
 
 def test_cloud_draws_every_group_normals_and_a_support():

@@ -51,6 +51,7 @@ def test_what_is_painted_is_the_domain():
         (one,) = pieces(cloud, np.zeros(len(cloud)), lambda x: np.zeros(len(x)))
         # The outline of a signed distance is a polygon of some hundred sides, its triangles of half spacings.
         assert abs(area(one.places, one.triangles) / size - 1) < 2e-2 and one.outline
+        assert len(one.triangles) >= 6000 and (one.places[: len(cloud)] == cloud.points).all(), "particles stay in front"
         (plain,) = pieces(cloud, np.zeros(len(cloud)), None)
         assert plain.outline, "numbers at the particles are clipped too"
     (loop,) = outline(disk)
@@ -136,7 +137,13 @@ def test_a_solid_by_pyvista(box):
     pyvista = pytest.importorskip("pyvista")
     pyvista.OFF_SCREEN = True
     plotter = js.plot.solid(box, field=2, cut={"x": 0.5})
-    assert abs(plotter.mesh.bounds[1] - 0.5) < 1e-6
+    body = plotter.mesh
+    section = np.abs(body.points[:, 0] - 0.5) < 1e-6
+    assert abs(body.bounds[1] - 0.5) < 1e-6 and section.sum() > 16
+    # u = x y on edges between particles 1/3 apart, linear along diagonals: off by a quarter of 1/9.
+    assert np.abs(body["u[2]"] - body.points[:, 0] * body.points[:, 1])[section].max() < 0.028
+    picture = plotter.screenshot(return_img=True)
+    assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 100, "nothing was drawn"
     plotter.close()
 
 
