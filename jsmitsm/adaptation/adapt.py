@@ -184,7 +184,7 @@ def adapt(
     """
     options = _checked(problem, make, tol, order, start, quantity, norm, max_particles, max_rounds, solve_options)
     began = time.perf_counter()
-    with bar("adapt", max_rounds, progress) as shown:
+    with bar("adapt", wanted=progress, parts=(("rounds", 1.0),)) as shown:
         cloud, spacing = first_cloud(make, start)
         search = Rounds(problem, make, float(tol), order, quantity, norm, max_particles, max_rounds, options, began)
         search.run(cloud, spacing, shown)

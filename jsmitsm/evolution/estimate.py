@@ -9,14 +9,14 @@ import numpy as np
 from jsmitsm.evolution.run import Run
 from jsmitsm.evolution.space.semidiscrete import Semidiscrete
 from jsmitsm.evolution.steps import dense_output
-from jsmitsm.runtime.progress import bar
+from jsmitsm.runtime.progress import PENCIL, bar
 from jsmitsm.taylor.multi_indices import HIGHEST
 
 # So many times are looked at.
 LOOKS = 10
 
 
-@bar("error estimate")
+@bar("error estimate", parts=(*PENCIL, ("times", 4.0)))
 def estimated(
     run: Run, times: np.ndarray, history: tuple[np.ndarray, np.ndarray], rates: np.ndarray | None, in_time: np.ndarray
 ) -> np.ndarray:
@@ -45,10 +45,12 @@ def _integrated(
     h = float(grid[1] - grid[0])
     resolvent = high.system.resolvent(h)
     y, out = np.zeros(high.system.size), [np.zeros((semi.n, semi.fields))]
-    for t in grid[1:]:
-        misfit = high.system.force(_misfit(semi, high, steps, values, rates, float(t)))
-        y = resolvent.solve(high.system.mass(y) + h * misfit)
-        out.append(high.placed(y[: high.system.n], np.zeros(len(high.held))))
+    with bar("times", len(grid) - 1) as shown:
+        for t in grid[1:]:
+            misfit = high.system.force(_misfit(semi, high, steps, values, rates, float(t)))
+            y = resolvent.solve(high.system.mass(y) + h * misfit)
+            out.append(high.placed(y[: high.system.n], np.zeros(len(high.held))))
+            shown.update(1)
     return np.stack(out)
 
 

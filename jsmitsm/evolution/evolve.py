@@ -17,7 +17,7 @@ from jsmitsm.evolution.regions.timed import regions_timed
 from jsmitsm.evolution.run import Run
 from jsmitsm.evolution.space.timed import timed
 from jsmitsm.runtime.arrays import ValueOrFunction
-from jsmitsm.runtime.progress import bar
+from jsmitsm.runtime.progress import PENCIL, bar
 from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.solution.arguments import Depth, of_regions
 
@@ -130,21 +130,21 @@ def evolve(
         "order": int(order), "scheme": scheme, "damping": damping, "stencils": stencils, "throw": throw,
         "depth": 0 if depth == "auto" else depth,
     }  # fmt: skip
-    run = (RegionsRun if several else Run)(made, cloud, start, t, began, **options)
     if is_traced(t):
         if not (save is None or isinstance(save, int)):
             raise ValueError("save: where t is traced by JAX, give a number of intervals instead of times")
         parts = saved_times(save, 0.0, 1.0)
     else:
         parts = saved_times(save, float(t[0]), float(t[1]))
-    if run.traced:
-        if steps is None:
-            raise ValueError(
-                "tol: under a JAX transform the steps must be known; give steps=, as many as a run with tol took"
-            )
-        return differentiable(run, int(steps), parts)
-    total = int(steps) if steps is not None else 1000
-    with bar("evolve", total, wanted=progress) as shown:
-        return march(run, None if steps is None else int(steps), None if tol is None else float(tol), parts, shown)
+    with bar("evolve", wanted=progress, parts=(*PENCIL, ("steps", 8.0))):
+        run = (RegionsRun if several else Run)(made, cloud, start, t, began, **options)
+        if run.traced:
+            if steps is None:
+                raise ValueError(
+                    "tol: under a JAX transform the steps must be known; give steps=, as many as a run with tol took"
+                )
+            return differentiable(run, int(steps), parts)
+        with bar("steps", int(steps) if steps is not None else 1000) as shown:
+            return march(run, None if steps is None else int(steps), None if tol is None else float(tol), parts, shown)
 
 

@@ -20,7 +20,7 @@ from jsmitsm.modes.question import Question, assembled, masses, operators, reduc
 from jsmitsm.modes.spectrum import in_real_numbers, modes, normalised, pairs
 from jsmitsm.runtime.arrays import ValueOrFunction
 from jsmitsm.runtime.errors import SolveError, short
-from jsmitsm.runtime.progress import bar
+from jsmitsm.runtime.progress import PENCIL, bar
 from jsmitsm.runtime.tracers import concrete, is_traced
 from jsmitsm.solution.arguments import Depth, check, of_regions
 
@@ -28,7 +28,7 @@ from jsmitsm.solution.arguments import Depth, check, of_regions
 _NOTHING = 1e-12
 
 
-@bar("eigen")
+@bar("eigen", parts=(*PENCIL, ("unknowns", 1.0), ("error estimate", 4.0)))
 def eigen(
     problem: Problem,
     cloud: Cloud,

@@ -10,12 +10,14 @@ from jsmitsm.discretization.pencil.assemble import Pencil
 from jsmitsm.modes.question import Question, assembled, reduced
 from jsmitsm.modes.spectrum import Pairs
 from jsmitsm.runtime.errors import SolveError
+from jsmitsm.runtime.progress import PENCIL, bar
 from jsmitsm.taylor.multi_indices import HIGHEST
 
 # Rows of two orders differ in the weight of their source by less than this.
 _OUTLIER = 4.0
 
 
+@bar("error estimate", parts=PENCIL)
 def errors(question: Question, found: Pairs) -> np.ndarray:
     """Estimated errors (k,) of the values; infinite where there is no other order to compare with.
 

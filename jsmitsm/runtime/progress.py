@@ -5,9 +5,11 @@ pipes or under pytest. Off for a block with ``js.no_progress``, for a process wi
 environment variable ``TQDM_DISABLE=1``.
 
 There is one bar at a time: what opens a bar inside of another's becomes a stage that the outer one
-names, "solve, local fits 40%", with the seconds that are left of it where it lasts, and "compiling (first call)" while
-that is what takes the time. A clock ticks beside it, also while one long call (a factorisation,
-a compilation) reports nothing.
+names, "solve, local fits 40%", and "compiling (first call)" while that is what takes the time. What is left of the whole
+call is told where its parts are known, else what is left of the stage. A clock ticks beside it, also while one long call
+(a factorisation, a compilation) reports nothing.
+
+tqdm draws. rich would bring the clock (ten lines here), but takes 0.15 s to import, and ipywidgets in notebooks.
 """
 
 from __future__ import annotations
@@ -27,6 +29,10 @@ DELAY, TICK, PAUSE = 1.5, 0.5, 0.1
 # A stage that has lasted so many seconds tells how many are left.
 LASTING = 2.0
 COMPILING = "compiling (first call)"
+# The parts of a call in their order: a word in the name of each stage, and its share of the time, about.
+Parts = tuple[tuple[str, float], ...]
+SOLVE: Parts = (("local fits", 2.0), ("unknowns", 1.0))
+PENCIL: Parts = (("local fits", 1.0), ("source fits", 1.0))
 
 
 class _Nothing:
@@ -35,6 +41,8 @@ class _Nothing:
     def update(self, n: int = 1) -> None: ...
 
     def note(self, text: str) -> None: ...
+
+    def reach(self, part: float) -> None: ...
 
     def stage(self, what: str, total: int | None) -> _Nothing:
         return self
@@ -45,12 +53,14 @@ class _Nothing:
 class _Bar:
     """A tqdm bar with a clock that ticks by itself."""
 
-    def __init__(self, what: str, total: int | None):
+    def __init__(self, what: str, total: int | None, parts: Parts = ()):
         tqdm = _bars()
         form = None if total else "{desc} [{elapsed}{postfix}]"
-        self.what, self.total = what, total
-        self._bar = tqdm(total=total, desc=what, delay=DELAY, mininterval=PAUSE, miniters=0, leave=False,
-                         bar_format=form)  # fmt: skip
+        if parts:
+            form = "{desc} [{elapsed}<{remaining}{postfix}] {percentage:.0f}% {bar:12}"
+        self.what, self.total, self._parts, self._begun = what, total, parts, 0
+        self._bar = tqdm(total=1.0 if parts else total, desc=what, delay=DELAY, mininterval=PAUSE, miniters=0,
+                         leave=False, bar_format=form, smoothing=0.0 if parts else 0.3)  # fmt: skip
         self._lock, self._done = threading.Lock(), threading.Event()
         self._clock = threading.Thread(target=self._tick, name=f"clock of {what}", daemon=True)
         self._clock.start()
@@ -73,8 +83,20 @@ class _Bar:
             self._bar.set_description_str(f"{self.what}, {text}" if text else self.what, refresh=False)
             self._bar.update(0)
 
+    def reach(self, part: float) -> None:
+        """Say which part of the whole call is done."""
+        with self._lock:
+            self._bar.n = max(self._bar.n, min(part, 1.0))
+
     def stage(self, what: str, total: int | None) -> Any:
-        return _Counted(self) if self.total else _Stage(self, what, total)
+        if self.total:
+            return _Counted(self)
+        place = next((k for k, (name, _) in enumerate(self._parts) if k >= self._begun and name in what), None)
+        if place is None:
+            return _Stage(self, what, total)
+        self._begun = place + 1
+        cuts = [sum(share for _, share in self._parts[:k]) for k in (place, place + 1, None)]
+        return _Stage(self, what, total, (cuts[0] / cuts[2], cuts[1] / cuts[2]))
 
     def close(self) -> None:
         self._done.set()
@@ -85,20 +107,25 @@ class _Bar:
 class _Stage:
     """What goes on inside of a bar, in its words."""
 
-    def __init__(self, outer: Any, what: str, total: int | None):
-        self.outer, self.what, self.total, self.done = outer, what, total, 0
+    def __init__(self, outer: Any, what: str, total: int | None, share: tuple[float, float] | None = None):
+        self.outer, self.what, self.total, self.done, self.share = outer, what, total, 0, share
         self.start = time.monotonic()
-        self.say("")
+        self.update(0)
 
     def update(self, n: int = 1) -> None:
         self.done += n
+        if self.share:
+            first, last = self.share
+            self.outer.reach(first + (last - first) * (self.done / self.total if self.total else 0.0))
         self.say("")
 
     def note(self, text: str) -> None: ...
 
+    def reach(self, part: float) -> None: ...
+
     def say(self, text: str) -> None:
         at = f" {self.done / self.total:.0%}" if self.total else f" {self.done}" if self.done else ""
-        if self.total and 0 < self.done < self.total and (gone := time.monotonic() - self.start) > LASTING:
+        if self.total and not self.share and 0 < self.done < self.total and (gone := time.monotonic() - self.start) > LASTING:
             at += f", {gone * (self.total / self.done - 1):.0f} s left"
         self.outer.say(self.what + at + (f", {text}" if text else ""))
 
@@ -106,6 +133,8 @@ class _Stage:
         return _Stage(self, what, total)
 
     def close(self) -> None:
+        if self.share:
+            self.outer.reach(self.share[1])
         self.outer.say("")
 
 
@@ -148,16 +177,17 @@ def no_progress() -> Iterator[None]:
 
 
 @contextmanager
-def bar(what: str, total: int | None = None, wanted: bool = True) -> Iterator[Any]:
+def bar(what: str, total: int | None = None, wanted: bool = True, parts: Parts = ()) -> Iterator[Any]:
     """A bar, a stage of the one that is shown, or nothing that looks like one.
 
-    It has ``update(n)`` and ``note(text)``. Also a decorator: ``@bar("what the function does")``.
+    It has ``update(n)``, ``note(text)`` and, with ``parts``, ``reach(part of the whole)``. Also a decorator:
+    ``@bar("what the function does")``. parts: the stages to come, from whose progress the rest of the call is estimated.
     """
     outer = _shown.get()
     if not wanted or (outer is None and not watched()):
         made: Any = _NOTHING
     else:
-        made = _Bar(what, total) if outer is None else outer.stage(what, total)
+        made = _Bar(what, total, parts) if outer is None else outer.stage(what, total)
     token = _shown.set(made)
     try:
         yield made

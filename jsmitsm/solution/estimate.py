@@ -45,7 +45,7 @@ class Correction:
     adjoint: Callable[[np.ndarray], np.ndarray] | None
 
 
-@bar("error estimate")
+@bar("error estimate", parts=(("local fits", 1.0), ("local fits", 3.0), ("unknowns", 1.0)))
 def correction(fit: Fit, values: Any) -> Correction:
     """The estimated error of the values (N, F), and what it comes from.
 

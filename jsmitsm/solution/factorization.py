@@ -17,7 +17,7 @@ from jsmitsm.discretization.leave_one_out import right_side, with_held
 from jsmitsm.equation.problem import Problem
 from jsmitsm.linear.linsolve import Solver
 from jsmitsm.particle.kernels import Kernel
-from jsmitsm.runtime.progress import bar
+from jsmitsm.runtime.progress import SOLVE, bar
 from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.solution.arguments import Depth, Formulation, Method, check, discretized, of_regions
 from jsmitsm.solution.fit import Fit, Recipe
@@ -131,7 +131,7 @@ def _same(x: Any, y: Any) -> bool:
     return np.shape(x) == np.shape(y) and not is_traced(x, y) and bool(np.array_equal(np.asarray(x), np.asarray(y)))
 
 
-@bar("factorize")
+@bar("factorize", parts=SOLVE)
 def factorize(
     problem: Problem, cloud: Cloud, *, method: Method = "S", order: int = 4, kernel: Kernel | None = None,
     stencils: Stencils | None = None, basis_terms: int | None = None, formulation: Formulation = "auto",

@@ -166,6 +166,49 @@ def test_a_compiled_solve_is_not_cut_up(monkeypatch):
     assert "local fits 27%" not in seen()
 
 
+def test_the_rest_of_a_whole_call_is_told_by_its_parts(monkeypatch):
+    """Half of the first of two parts is a quarter of the call, so that three times what is gone is left."""
+    seen = watch(monkeypatch)
+    with progress.bar("solve", parts=(("local fits", 1.0), ("unknowns", 1.0))) as shown:
+        shown._bar.start_t -= 60.0
+        with progress.bar("neighbours"):
+            assert "[01:00<?]" in seen()
+        with progress.bar("local fits", 4) as stage:
+            stage.update(2)
+            assert "solve, local fits 50% [01:00<03:00] 25%" in seen()
+        with progress.bar("cholmod on 9 unknowns"):
+            assert "cholmod on 9 unknowns [01:00<01:00] 50%" in seen()
+
+
+def test_long_calls_tell_their_rest(monkeypatch):
+    """The parts that they name are the stages that they have."""
+    whole = {}
+
+    def seen(self, part):
+        whole.setdefault(self.what, []).append(part)
+
+    watch(monkeypatch)
+    monkeypatch.setattr(progress._Bar, "reach", seen)
+    sol = js.solve(LINEAR, LINE, solver="sparse")
+    sol.error_estimate()
+    modes = js.eigen(js.Problem(lambda u, x: -js.laplacian(u)(x), ENDS), LINE, 2, order=4)
+    with js.no_progress():
+        found = js.eigen(js.Problem(lambda u, x: -js.laplacian(u)(x), ENDS), LINE, 2, order=4)
+    modes.error_estimate(), found.error_estimate()
+    heat = js.Problem(lambda u, x, t: js.dt(u)(x) - js.laplacian(u)(x), ENDS)
+    run = js.evolve(heat, LINE, lambda x: x[0] * (1 - x[0]), t=(0.0, 0.1), steps=4)
+    js.adapt(LINEAR, lambda h: js.interval(0.0, 1.0, spacing=h), 1e-6, start=0.2)
+    assert set(whole) >= {"solve", "error estimate", "eigen", "evolve", "adapt"}
+    for what in whole.keys() - {"error estimate", "eigen"}:
+        assert max(whole[what]) > 0.99, f"{what} arrives"
+    for what, parts in whole.items():
+        if what not in ("solve", "error estimate"):  # of several calls
+            assert parts == sorted(parts), what
+    whole.clear()
+    run.error_estimate()
+    assert whole["error estimate"] == sorted(whole["error estimate"]) and whole["error estimate"][-1] == 1.0
+
+
 def test_compiling_and_what_is_left_are_told(monkeypatch):
     """A stage that lasts tells the rest by what is done; a program's first run tells that it is compiled."""
     seen = watch(monkeypatch)
