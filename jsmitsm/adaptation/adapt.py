@@ -17,7 +17,7 @@ from jsmitsm.equation.problem import Problem
 from jsmitsm.equation.unknowns.extras import refuse_extras
 from jsmitsm.linear.linsolve import Solver
 from jsmitsm.runtime.arrays import ValueOrFunction
-from jsmitsm.runtime.errors import did_you_mean, is_number, is_whole, short
+from jsmitsm.runtime.errors import did_you_mean, explaining, is_number, is_whole, short
 from jsmitsm.runtime.progress import bar
 from jsmitsm.solution.arguments import Depth, Formulation, Method
 from jsmitsm.solution.solution import Solution
@@ -109,6 +109,7 @@ class Adapted:
         )
 
 
+@explaining
 def adapt(
     problem: Problem,
     make: Make,

@@ -10,7 +10,7 @@ import numpy as np
 
 from jsmitsm.runtime import notebooks
 from jsmitsm.runtime.arrays import Array, ArrayLike
-from jsmitsm.runtime.errors import refuse_masked, some
+from jsmitsm.runtime.errors import explaining, refuse_masked, some
 from jsmitsm.runtime.tracers import frozen, is_traced, owned
 
 INTERIOR = "interior"
@@ -91,6 +91,7 @@ class Cloud:
     cell_groups = Groups({})  # also of clouds pickled before there were any
     _shape: Any = None  # what the particles fill, where their maker knows it: pictures end there
 
+    @explaining
     def __init__(
         self,
         points: ArrayLike,

@@ -13,7 +13,7 @@ from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.cloud.regions.region_cloud import RegionCloud
 from jsmitsm.particle.kernels import EDGE
 from jsmitsm.runtime.arrays import Array, ArrayLike
-from jsmitsm.runtime.errors import short
+from jsmitsm.runtime.errors import explaining, short
 from jsmitsm.runtime.interrupts import interruptible
 from jsmitsm.runtime.progress import bar
 from jsmitsm.runtime.threads import cores
@@ -71,6 +71,7 @@ class Stencils:
         return f"Stencils({len(self)} particles, at most {self.width} neighbours each, themselves counted)"
 
 
+@explaining
 @bar("neighbours")
 def stencils(cloud: Cloud, *, size: int | None = None, radius: ArrayLike | None = None) -> Stencils:
     """Find every particle's neighbours, once, on the host.

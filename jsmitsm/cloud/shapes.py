@@ -12,7 +12,7 @@ from jsmitsm.cloud.cloud import INTERIOR, Cloud
 from jsmitsm.cloud.filling import SpacingLike
 from jsmitsm.cloud.packing.octree import Region, Spacing
 from jsmitsm.runtime.arrays import ArrayLike
-from jsmitsm.runtime.errors import short
+from jsmitsm.runtime.errors import explaining, short
 from jsmitsm.runtime.progress import bar
 
 # The cosine of 5 degrees: boundary particles whose normals differ by more may stand on two sides of a corner.
@@ -22,6 +22,7 @@ _SMOOTH = np.cos(np.radians(30.0))
 Predicate = Callable[[np.ndarray], Any]
 
 
+@explaining
 @bar("cloud")
 def from_sdf(
     sdf: Callable[[Any], Any],
@@ -89,6 +90,7 @@ def from_sdf(
     return _cloud(region, rule, lo, hi, boundary, named, seed, not callable(spacing))
 
 
+@explaining
 @bar("cloud")
 def from_polygon(
     vertices: ArrayLike,

@@ -10,7 +10,7 @@ import numpy as np
 
 from jsmitsm.equation.traced import Traced
 from jsmitsm.runtime.arrays import ArrayLike, ValueOrFunction
-from jsmitsm.runtime.errors import refuse_masked, short
+from jsmitsm.runtime.errors import explaining, refuse_masked, short
 from jsmitsm.runtime.tracers import is_traced
 
 
@@ -74,6 +74,7 @@ class Condition:
         return f"{self.kind}({', '.join(shown + ([f'field={self.field}'] if self.field is not None else []))})"
 
 
+@explaining
 def dirichlet(value: ValueOrFunction, field: int | None = None) -> Condition:
     """u = value on a group.
 
@@ -104,6 +105,7 @@ def dirichlet(value: ValueOrFunction, field: int | None = None) -> Condition:
     return Condition("dirichlet", _field(field), value=checked_value(value, "value"))
 
 
+@explaining
 def neumann(value: ValueOrFunction, field: int | None = None) -> Condition:
     """n . grad u = value on a group, n the outward unit normal.
 
@@ -133,6 +135,7 @@ def neumann(value: ValueOrFunction, field: int | None = None) -> Condition:
     return Condition("neumann", _field(field), value=checked_value(value, "value"))
 
 
+@explaining
 def robin(
     a: ValueOrFunction, b: ValueOrFunction, value: ValueOrFunction, field: int | None = None
 ) -> Condition:
@@ -168,6 +171,7 @@ def robin(
     return Condition("robin", _field(field), a=a, b=b, value=checked_value(value, "value"))
 
 
+@explaining
 def condition(residual: Callable[..., Any]) -> Condition:
     """A general condition, residual = 0.
 
@@ -198,6 +202,7 @@ def condition(residual: Callable[..., Any]) -> Condition:
     return Condition("condition", residual=residual)
 
 
+@explaining
 def periodic(first: str, second: str) -> Condition:
     """Two groups that are images of each other under a translation.
 
@@ -229,6 +234,7 @@ def periodic(first: str, second: str) -> Condition:
     return Condition("periodic", groups=(first, second))
 
 
+@explaining
 def fix(indices: ArrayLike, value: ValueOrFunction, field: int | None = None) -> Condition:
     """Hold some particles, interior ones too.
 

@@ -15,7 +15,7 @@ from jsmitsm.equation.unknowns.constraint import Constraint
 from jsmitsm.equation.unknowns.extras import Extras, extras
 from jsmitsm.equation.unknowns.point_source import PointSource
 from jsmitsm.runtime import notebooks
-from jsmitsm.runtime.errors import did_you_mean, short
+from jsmitsm.runtime.errors import did_you_mean, explaining, short
 
 
 @jax.tree_util.register_pytree_node_class
@@ -63,6 +63,7 @@ class Problem:
     Problem(fields=1, left: dirichlet(value=0.0), right: neumann(value=0.0))
     """
 
+    @explaining
     def __init__(
         self,
         pde: Callable[..., Any] | Mapping[str, Callable[..., Any]],

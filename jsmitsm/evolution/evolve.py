@@ -17,11 +17,13 @@ from jsmitsm.evolution.regions.timed import regions_timed
 from jsmitsm.evolution.run import Run
 from jsmitsm.evolution.space.timed import timed
 from jsmitsm.runtime.arrays import ValueOrFunction
+from jsmitsm.runtime.errors import explaining
 from jsmitsm.runtime.progress import PENCIL, bar
 from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.solution.arguments import Depth, of_regions
 
 
+@explaining
 def evolve(
     problem: Problem,
     cloud: Cloud,

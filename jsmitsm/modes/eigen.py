@@ -19,7 +19,7 @@ from jsmitsm.modes.modes import Modes
 from jsmitsm.modes.question import Question, assembled, masses, operators, reduced
 from jsmitsm.modes.spectrum import in_real_numbers, modes, normalised, pairs
 from jsmitsm.runtime.arrays import ValueOrFunction
-from jsmitsm.runtime.errors import SolveError, short
+from jsmitsm.runtime.errors import SolveError, explaining, short
 from jsmitsm.runtime.progress import PENCIL, bar
 from jsmitsm.runtime.tracers import concrete, is_traced
 from jsmitsm.solution.arguments import Depth, check, of_regions
@@ -28,6 +28,7 @@ from jsmitsm.solution.arguments import Depth, check, of_regions
 _NOTHING = 1e-12
 
 
+@explaining
 @bar("eigen", parts=(*PENCIL, ("unknowns", 1.0), ("error estimate", 4.0)))
 def eigen(
     problem: Problem,

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm.runtime.arrays import Array, ArrayLike
-from jsmitsm.runtime.errors import did_you_mean, in_words, short
+from jsmitsm.runtime.errors import did_you_mean, explaining, in_words, short
 from jsmitsm.runtime.snapshot import ScalarFunction, snapshot
 from jsmitsm.runtime.tracers import is_traced
 
@@ -51,6 +51,7 @@ class Kernel:
     Kernel(h=0.2, d=2)
     """
 
+    @explaining
     def __init__(self, profile: Callable[..., Any], h: ArrayLike, d: ArrayLike, params: Any = None):
         if not callable(profile):
             raise ValueError(
@@ -201,6 +202,7 @@ class Kernel:
 class _Named(Kernel):
     """A kernel with a profile of its own: needs only h and d."""
 
+    @explaining
     def __init__(self, h: ArrayLike, d: ArrayLike):
         self._profile = None  # type: ignore[assignment]  # the class has its own
         self.params = None

@@ -6,6 +6,8 @@ import difflib
 import re
 import sys
 from collections.abc import Iterable, Sequence
+from contextlib import ContextDecorator
+from types import TracebackType
 from typing import Any
 
 import jax
@@ -36,6 +38,30 @@ SYMPTOMS = {
     "are not resolved, or spurious": "modes",
     "shorter than four": "modes",
     "far from self-adjoint": "self-adjoint",
+}
+# What an error says, and its place on that page; else the page about the argument that it begins with.
+REFUSALS = {
+    "js.meant": "branch",
+    "data do not balance": "balance",
+    "Newton's method": "newton",
+    "too coarse for the shape": "coarse",
+    "before the transform": "stencils",
+    " GB for ": "memory",
+    "no condition": "conditions",
+    "takes one condition": "conditions",
+    "is singular": "resonance",
+    "do not determine the solution": "resonance",
+}
+PAGES = {
+    "problems": "bcs constraint constraints field fields indices params pde periodic problem sources unknowns",
+    "clouds": "a b bounds cloud groups hi holes jitter lo n normals points sdf shape spacing vertices",
+    "regions": "interfaces region regions shapes",
+    "choosing": "basis_terms d depth formulation h kernel method order radius size stencils",
+    "time": "damping save scheme steps t",
+    "modes": "count mass near",
+    "adaptivity": "make max_particles max_rounds quantity start",
+    "gradients": "objective optimizer parameters",
+    "pictures": "ax at mesh path polygon tags",
 }
 _LONGEST = 200  # letters of a value that a message quotes
 
@@ -85,6 +111,40 @@ def explained(flags: Iterable[str]) -> list[str]:
         anchor = next((f"#{name}" for words, name in SYMPTOMS.items() if words in flag), "")
         out.append(flag if "(docs: " in flag else f"{flag} (docs: symptoms{anchor})")
     return out
+
+
+class _Explaining(ContextDecorator):
+    """``@explaining``: what this public function refuses ends with the place in the documentation that helps."""
+
+    def __enter__(self) -> None: ...
+
+    def __exit__(self, kind: Any, error: BaseException | None, trace: TracebackType | None) -> None:
+        if isinstance(error, SolveError) or isinstance(error, ValueError) and _own(trace):
+            error.args = (placed(str(error)), *error.args[1:])
+
+
+explaining = _Explaining()
+
+
+def _own(trace: TracebackType | None) -> bool:
+    """Whether an error was raised in this package, not in a user's function or another library."""
+    while trace is not None and trace.tb_next is not None:
+        trace = trace.tb_next
+    return trace is not None and str(trace.tb_frame.f_globals.get("__name__")).startswith("jsmitsm.")
+
+
+def placed(message: str) -> str:
+    """An error's message with the place in the documentation.
+
+    >>> placed("pde: expected a function, got 3"), placed("tol: expected a number")
+    ('pde: expected a function, got 3 (docs: problems)', 'tol: expected a number (docs: symptoms#errors)')
+    """
+    if "(docs: " in message:
+        return message
+    place = next((name for words, name in REFUSALS.items() if words in message), None)
+    argument = re.match(r"\w*", message)
+    page = next((page for page, names in PAGES.items() if argument and argument[0] in names.split()), "symptoms#errors")
+    return f"{message} (docs: {f'symptoms#{place}' if place else page})"
 
 
 def some(index: Any, most: int = 6) -> str:

@@ -5,9 +5,9 @@ pipes or under pytest. Off for a block with ``js.no_progress``, for a process wi
 environment variable ``TQDM_DISABLE=1``.
 
 There is one bar at a time: what opens a bar inside of another's becomes a stage that the outer one
-names, "solve, local fits 40%", and "compiling (first call)" while that is what takes the time. What is left of the whole
-call is told where its parts are known, else what is left of the stage. A clock ticks beside it, also while one long call
-(a factorisation, a compilation) reports nothing.
+names, "solve, local fits 40%", and "compiling (first call)" while that is what takes the time. What is left of the
+whole call is told where its parts are known, else what is left of the stage. A clock ticks beside it, also while one
+long call (a factorisation, a compilation) reports nothing.
 
 tqdm draws. rich would bring the clock (ten lines here), but takes 0.15 s to import, and ipywidgets in notebooks.
 """
@@ -125,7 +125,8 @@ class _Stage:
 
     def say(self, text: str) -> None:
         at = f" {self.done / self.total:.0%}" if self.total else f" {self.done}" if self.done else ""
-        if self.total and not self.share and 0 < self.done < self.total and (gone := time.monotonic() - self.start) > LASTING:
+        gone = time.monotonic() - self.start
+        if self.total and not self.share and 0 < self.done < self.total and gone > LASTING:
             at += f", {gone * (self.total / self.done - 1):.0f} s left"
         self.outer.say(self.what + at + (f", {text}" if text else ""))
 
@@ -181,7 +182,7 @@ def bar(what: str, total: int | None = None, wanted: bool = True, parts: Parts =
     """A bar, a stage of the one that is shown, or nothing that looks like one.
 
     It has ``update(n)``, ``note(text)`` and, with ``parts``, ``reach(part of the whole)``. Also a decorator:
-    ``@bar("what the function does")``. parts: the stages to come, from whose progress the rest of the call is estimated.
+    ``@bar("what the function does")``. parts: the stages to come, by which the rest of the call is estimated.
     """
     outer = _shown.get()
     if not wanted or (outer is None and not watched()):

@@ -16,6 +16,7 @@ from jsmitsm.cloud.mesh_facets import Mesh
 from jsmitsm.cloud.regions.region_cloud import RegionCloud
 from jsmitsm.cloud.shapes import from_polygon
 from jsmitsm.cloud.triangulation import simplices
+from jsmitsm.runtime.errors import explaining
 from jsmitsm.show.mesh_cloud import cloud_of
 from jsmitsm.show.mesh_files import needed, read_mesh
 from jsmitsm.show.mesh_regions import regions_of
@@ -29,6 +30,7 @@ _AXES = "xyz"
 _CELLS = {1: "line", 2: "triangle", 3: "tetra"}
 
 
+@explaining
 def from_mesh(mesh: Any, tags: str | None = None, *, regions: bool | list[str] = False) -> Cloud:
     """The nodes of a mesh as particles, boundary groups from its physical tags, normals from its boundary facets.
 

@@ -75,7 +75,8 @@ def _refined(places: np.ndarray, cells: np.ndarray) -> tuple[np.ndarray, np.ndar
     from matplotlib.tri import Triangulation, UniformTriRefiner
 
     times = max(0, math.ceil(math.log(_FINE / len(cells), 4)))
-    finer: Any = UniformTriRefiner(Triangulation(*places.T, cells)).refine_triangulation(subdiv=times)
+    coarse: Any = Triangulation(places[:, 0], places[:, 1], cells)
+    finer: Any = UniformTriRefiner(coarse).refine_triangulation(subdiv=times)
     return np.stack([finer.x, finer.y], axis=1), finer.triangles
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.cloud.quadrature import quadrature
 from jsmitsm.runtime.arrays import ArrayLike, ValueOrFunction
+from jsmitsm.runtime.errors import explaining
 from jsmitsm.runtime.tracers import frozen, is_traced
 from jsmitsm.solution.evaluation import checked_points, evaluated, in_domain, nearest_particles
 from jsmitsm.solution.fit import Recipe
@@ -53,6 +54,7 @@ class Anywhere:
             self._fitted = frozen(fitted)
         return self._fitted
 
+    @explaining
     def __call__(self, points: ArrayLike, *, blend: bool = False, outside: str = "nan") -> jax.Array:
         """Values anywhere, from the local Taylor polynomials.
 
@@ -93,6 +95,7 @@ class Anywhere:
         """
         return self.derivative(points, (0,) * self.cloud.dim, blend=blend, outside=outside)
 
+    @explaining
     def grad(self, points: ArrayLike, *, blend: bool = False, outside: str = "nan") -> jax.Array:
         """Gradients anywhere.
 
@@ -128,6 +131,7 @@ class Anywhere:
         unit = [tuple(map(int, b)) for b in np.eye(self.cloud.dim, dtype=int)]
         return jnp.stack([self.derivative(points, b, blend=blend, outside=outside) for b in unit], axis=-1)
 
+    @explaining
     def derivative(
         self, points: ArrayLike, multi_index: Sequence[int], *, blend: bool = False, outside: str = "nan"
     ) -> jax.Array:

@@ -17,6 +17,7 @@ from jsmitsm.discretization.leave_one_out import right_side, with_held
 from jsmitsm.equation.problem import Problem
 from jsmitsm.linear.linsolve import Solver
 from jsmitsm.particle.kernels import Kernel
+from jsmitsm.runtime.errors import explaining
 from jsmitsm.runtime.progress import SOLVE, bar
 from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.solution.arguments import Depth, Formulation, Method, check, discretized, of_regions
@@ -51,6 +52,7 @@ class Factorization(KeptMatrix):
         *matrix, self._right = self._run.assembled(self._nums, self._parts)
         super().__init__(tuple(matrix))
 
+    @explaining
     @bar("solve")
     def solve(self, problem: Problem) -> Solution:
         """The solution of a problem with the same operator; source and boundary values may differ.
@@ -131,6 +133,7 @@ def _same(x: Any, y: Any) -> bool:
     return np.shape(x) == np.shape(y) and not is_traced(x, y) and bool(np.array_equal(np.asarray(x), np.asarray(y)))
 
 
+@explaining
 @bar("factorize", parts=SOLVE)
 def factorize(
     problem: Problem, cloud: Cloud, *, method: Method = "S", order: int = 4, kernel: Kernel | None = None,

@@ -12,7 +12,7 @@ import numpy as np
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.runtime import notebooks
 from jsmitsm.runtime.arrays import Array
-from jsmitsm.runtime.errors import SolveError, explained
+from jsmitsm.runtime.errors import SolveError, explained, explaining
 from jsmitsm.runtime.tracers import frozen, is_traced, owned
 from jsmitsm.solution.anywhere import Anywhere
 from jsmitsm.solution.estimate import Correction, correction
@@ -115,6 +115,7 @@ class Solution(Anywhere):
         fitted = self._taylor
         return fitted[:, 0] if self._recipe.fields == 1 else jnp.swapaxes(fitted, 1, 2)
 
+    @explaining
     def error_estimate(self) -> Array:
         """Estimated error |u - u_exact| at every particle, by defect correction.
 

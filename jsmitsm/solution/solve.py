@@ -18,6 +18,7 @@ from jsmitsm.equation.unknowns.two_fields import two_fields, two_parts
 from jsmitsm.linear.linsolve import Solver
 from jsmitsm.particle.kernels import Kernel
 from jsmitsm.runtime.arrays import ValueOrFunction
+from jsmitsm.runtime.errors import explaining
 from jsmitsm.runtime.progress import SOLVE, bar
 from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.solution.arguments import Depth, Formulation, Method, check, of_regions
@@ -33,6 +34,7 @@ from jsmitsm.solution.unknowns.constrained import solve_constrained
 from jsmitsm.solution.unknowns.point_solution import PointSolution, check_inside
 
 
+@explaining
 @bar("solve", parts=SOLVE)
 def solve(
     problem: Problem,

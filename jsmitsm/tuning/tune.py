@@ -19,7 +19,7 @@ from jsmitsm.discretization.supports import default_kernel
 from jsmitsm.equation.problem import Problem
 from jsmitsm.particle.kernels import Kernel
 from jsmitsm.runtime.arrays import ArrayLike, ValueOrFunction
-from jsmitsm.runtime.errors import did_you_mean, is_whole
+from jsmitsm.runtime.errors import did_you_mean, explaining, is_whole
 from jsmitsm.runtime.progress import bar
 from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.solution.arguments import SolveOptions, check, discretized
@@ -83,6 +83,7 @@ class TuneResult:
         return f"TuneResult({self.kernel!r}, objective {seen[0]:.3g} -> {best:.3g}, {self.solves} solves)"
 
 
+@explaining
 def tune(
     problem: Problem,
     cloud: Cloud,

@@ -51,7 +51,7 @@ def test_what_is_painted_is_the_domain():
         (one,) = pieces(cloud, np.zeros(len(cloud)), lambda x: np.zeros(len(x)))
         # The outline of a signed distance is a polygon of some hundred sides, its triangles of half spacings.
         assert abs(area(one.places, one.triangles) / size - 1) < 2e-2 and one.outline
-        assert len(one.triangles) >= 6000 and (one.places[: len(cloud)] == cloud.points).all(), "particles stay in front"
+        assert len(one.triangles) >= 6000 and (one.places[: len(cloud)] == cloud.points).all()
         (plain,) = pieces(cloud, np.zeros(len(cloud)), None)
         assert plain.outline, "numbers at the particles are clipped too"
     (loop,) = outline(disk)

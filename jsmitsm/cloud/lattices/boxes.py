@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 
 from jsmitsm.cloud.cloud import INTERIOR, Cloud
-from jsmitsm.runtime.errors import short
+from jsmitsm.runtime.errors import explaining, short
 
 _SIDES = (("left", 0, 0), ("right", 0, 1), ("bottom", 1, 0), ("top", 1, 1), ("front", 2, 0), ("back", 2, 1))
 
 
+@explaining
 def rectangle(
     lo: Sequence[float], hi: Sequence[float], shape: Sequence[int], jitter: float = 0.0, seed: int = 0
 ) -> Cloud:
@@ -50,6 +51,7 @@ def rectangle(
     return lattice(lo, hi, shape, jitter, seed, dim=2)
 
 
+@explaining
 def box(lo: Sequence[float], hi: Sequence[float], shape: Sequence[int], jitter: float = 0.0, seed: int = 0) -> Cloud:
     """A lattice of particles on a box; groups as in ``js.rectangle``, then front (low z) and back (high z).
 

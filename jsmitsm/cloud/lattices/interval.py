@@ -10,9 +10,10 @@ from jsmitsm.cloud.cloud import INTERIOR, Cloud
 from jsmitsm.cloud.filling import SpacingLike, divide, spacing_function
 from jsmitsm.cloud.lattices.boxes import lattice
 from jsmitsm.cloud.lattices.path import followed
-from jsmitsm.runtime.errors import short
+from jsmitsm.runtime.errors import explaining, short
 
 
+@explaining
 def interval(a: float, b: float, n: int | None = None, *, spacing: SpacingLike | None = None) -> Cloud:
     """Particles on [a, b], ascending, both ends among them; groups interior, left, right.
 

@@ -16,7 +16,7 @@ from jsmitsm.cloud.regions.region_cloud import RegionCloud
 from jsmitsm.cloud.regions.shapes import Interval, Shape, shape_of
 from jsmitsm.cloud.shapes import Predicate, checked_bounds, checked_seed, grouped, own_normals
 from jsmitsm.runtime.arrays import ArrayLike
-from jsmitsm.runtime.errors import short
+from jsmitsm.runtime.errors import explaining, short
 from jsmitsm.runtime.progress import bar
 
 # A particle is on the boundary of a shape if it is nearer to it than this part of the whole domain.
@@ -27,6 +27,7 @@ _PROBE, _PROBES = 0.02, 24
 _GAP, _OVERLAP = 0.4, 0.02
 
 
+@explaining
 @bar("cloud")
 def regions(
     shapes: Mapping[str, Any],

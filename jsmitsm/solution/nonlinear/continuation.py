@@ -11,7 +11,7 @@ from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.equation.problem import Problem
 from jsmitsm.particle.kernels import Kernel
 from jsmitsm.runtime.arrays import Array, ValueOrFunction
-from jsmitsm.runtime.errors import SolveError, is_whole
+from jsmitsm.runtime.errors import SolveError, explaining, is_whole
 from jsmitsm.runtime.progress import bar
 from jsmitsm.solution.arguments import SolveOptions
 from jsmitsm.solution.nonlinear.branch import Branch, follow
@@ -44,6 +44,7 @@ def continuation(
 ) -> Branch: ...  # fmt: skip
 
 
+@explaining
 def continuation(
     problem: Callable[[float], Problem],
     cloud: Cloud,
@@ -58,12 +59,12 @@ def continuation(
 
     Parameters
     ----------
-    problem : Problem
-        Function Of one number; returns the problem to solve.
+    problem : callable
+        A function of one number that returns the problem to solve.
     cloud : Cloud
         The particles it is solved on.
-    parameters : str or sequence of str
-        Sequence of float The stages, in the order in which to go; two or more.
+    parameters : sequence of float
+        The stages, in the order in which to go; two or more.
     u0 : array_like or function, optional
         Start of the first stage, as in ``js.solve``.
     arclength : bool
@@ -77,7 +78,8 @@ def continuation(
 
     Returns
     -------
-    list of Solution : one for each of ``parameters``. Where Newton's method fails, the way to the
+    list of Solution
+        One for each of ``parameters``. Where Newton's method fails, the way to the
         next parameter is halved. With ``arclength`` a list with attributes, of the solutions at those
         of the parameters that were reached: ``parameters`` (these), ``branch``, a list of (parameter,
         Solution) of all steps, and ``folds``, the parameters at which the branch turns back.

@@ -11,7 +11,7 @@ import numpy as np
 
 from jsmitsm.cloud.regions.region_cloud import sides
 from jsmitsm.runtime.arrays import ArrayLike, ValueOrFunction
-from jsmitsm.runtime.errors import did_you_mean
+from jsmitsm.runtime.errors import did_you_mean, explaining
 from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.solution.evaluation import checked_points
 from jsmitsm.solution.regions.fit import RegionPart
@@ -42,6 +42,7 @@ class RegionsSolution(Solution):
 
     cloud: Any
 
+    @explaining
     def region(self, name: str) -> Solution:
         """The solution of one region, on its own cloud with outward normals.
 
@@ -93,6 +94,7 @@ class RegionsSolution(Solution):
             found[name] = one
         return one
 
+    @explaining
     def __call__(
         self, points: ArrayLike, *, region: str | None = None, blend: bool = False, outside: str = "nan"
     ) -> jax.Array:
@@ -132,6 +134,7 @@ class RegionsSolution(Solution):
         """
         return self.derivative(points, (0,) * self.cloud.dim, region=region, blend=blend, outside=outside)
 
+    @explaining
     def grad(
         self, points: ArrayLike, *, region: str | None = None, blend: bool = False, outside: str = "nan"
     ) -> jax.Array:
@@ -173,6 +176,7 @@ class RegionsSolution(Solution):
         made = [self.derivative(points, b, region=region, blend=blend, outside=outside) for b in unit]
         return jnp.stack(made, axis=-1)
 
+    @explaining
     def derivative(
         self, points: ArrayLike, multi_index: Sequence[int], *, region: str | None = None, blend: bool = False,
         outside: str = "nan",
