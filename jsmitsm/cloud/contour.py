@@ -1,7 +1,7 @@
 """Boundary particles of a signed-distance-like function in 1D and 2D: ends of intervals, closed curves with corners.
 
-contourpy would need values on a whole lattice, of the finest spacing where it varies: 2.8 s against 0.3 s for a star in a
-box of 1000 spacings, and it rounds corners off.
+contourpy would need values on a whole lattice, of the finest spacing where it varies: 2.8 s against 0.3 s for a star
+in a box of 1000 spacings, and it rounds corners off.
 """
 
 from __future__ import annotations

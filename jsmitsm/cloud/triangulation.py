@@ -1,7 +1,7 @@
 """Triangles and tetrahedra between the particles of a cloud, holes and notches left out: for pictures and files.
 
-Qhull makes them, by scipy; which of them lie in the domain no library knows. A cut is one for matplotlib, where pyvista,
-ten times as fast (3 ms for 53,000 tetrahedra), is not installed.
+Qhull makes them, by scipy; which of them lie in the domain no library knows. A cut is one for matplotlib, where
+pyvista, ten times as fast (3 ms for 53,000 tetrahedra), is not installed.
 """
 
 from __future__ import annotations

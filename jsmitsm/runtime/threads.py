@@ -1,7 +1,8 @@
 """Work shared among the cores: one JAX program runs on one core, so pieces of a cloud run side by side.
 
-The threads are those of concurrent.futures; ``Executor.map`` takes as long (57 ms against 62 ms for 16 pieces), but would
-compile a program once on each core, under JAX's settings for new threads, and waits for itself where calls nest.
+The threads are those of concurrent.futures; ``Executor.map`` takes as long (57 ms against 62 ms for 16 pieces), but
+would compile a program once on each core, under JAX's settings for new threads, and waits for itself where calls
+nest.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Gradient descent over a kernel's parameters that steps back where it must.
 
-The steps are optax's. By its loop alone one search of 24 steps ended with NaN, after 7 kernels that determine no solution;
-no transformation of optax's looks at a new point before it is taken, nor returns to the best one.
+The steps are optax's. By its loop alone one search of 24 steps ended with NaN, after 7 kernels that determine no
+solution; no transformation of optax's looks at a new point before it is taken, nor returns to the best one.
 """
 
 from __future__ import annotations
