@@ -397,6 +397,4 @@ def _short(value: Any) -> str:
     if isinstance(value, jax.core.Tracer):
         return str(value.aval.str_short())
     array = np.asarray(value)
-    if array.ndim:
-        return f"{array.min():.4g}..{array.max():.4g} ({array.size} particles)"
-    return f"{float(array):.6g}"
+    return f"{array.min():.4g}..{array.max():.4g} ({array.size} particles)" if array.ndim else f"{float(array):.6g}"

@@ -99,8 +99,7 @@ def _check_names(shapes: Any) -> None:
     for name in shapes:
         if not isinstance(name, str) or not name or "|" in name or name in (INTERIOR, "boundary"):
             raise ValueError(
-                f'shapes: {name!r} cannot name a region; take a string without "|", other than "interior" and '
-                '"boundary"'
+                f'shapes: {name!r} cannot name a region; take a string without "|", not "interior" nor "boundary"'
             )
 
 
