@@ -71,6 +71,7 @@ def test_files_and_pictures_linked_exist():
     for page in (ROOT / "README.md", *(ROOT / "docs").glob("*.md")):
         for target in re.findall(r"\]\(([^)#:$\\]+\.\w+)(?:#[^)]*)?\)", page.read_text()):
             source = re.sub(r"^notebooks/(\w+)\.md$", r"../notebooks/\1.ipynb", target)  # of which the page is made
+            source = re.sub(r"^(gallery/\w+)\.md$", r"\1.py", source)
             assert (page.parent / source).exists(), f"{page.name} links to {target}"
 
 
