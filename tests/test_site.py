@@ -151,7 +151,7 @@ def test_pages_in_chromium(site, width, tmp_path):
                "--enable-logging=stderr", "--virtual-time-budget=20000", "--window-size=1600,900"]  # fmt: skip
     address = f"http://127.0.0.1:{server.server_port}/frame.html"
     try:
-        made = subprocess.run([CHROMIUM, *options, "--dump-dom", address], capture_output=True, text=True, timeout=240)
+        made = subprocess.run([CHROMIUM, *options, "--dump-dom", address], capture_output=True, text=True, timeout=600)
     finally:
         server.shutdown()
     found = re.search(r'data-seen="([^"]*)"', made.stdout)
