@@ -173,7 +173,8 @@ def recipe(seed: int, number: int) -> Recipe:
     op = OPERATORS[operator]
     method = _method(rng, op, dim)
     orders = ORDERS[dim] if method == "S" else OTHERS[dim]
-    fits = {p: w for p, w in orders.items() if p >= max(op.order, 2) and not (op.fields(dim) > 2 and p > 6)}
+    most = 8 if op.fields(dim) < 3 else 6 if dim < 3 else 4  # beyond, their programs compile for minutes
+    fits = {p: w for p, w in orders.items() if max(op.order, 2) <= p <= most}
     order = int(_drawn(rng, fits or {4: 1.0}))
     form = _drawn(rng, FORMS) if method == "S" and op.conditions == "elliptic" else "auto"
     domain, size = _domain(rng, dim, op, order)

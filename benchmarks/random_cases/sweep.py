@@ -19,7 +19,7 @@ DATA = Path(__file__).parent.parent / "data" / "random.json"
 # So many cases make the sweep.
 WHOLE = 4000
 # So many cases of a recipe at a time.
-TURN = 8
+TURN = 20
 CLASSES, METHODS = ("linear", "nonlinear", "system"), ("S", "I", "II", "III", "SSPH")
 
 

@@ -18,15 +18,23 @@ from jsmitsm.discretization.leave_one_out import matrix, right_side, with_held
 from jsmitsm.discretization.resolution.digits import room
 from jsmitsm.discretization.rows import all_rows
 from jsmitsm.particle.moments import Row
+from jsmitsm.runtime.errors import SolveError
 from jsmitsm.runtime.progress import bar
 from jsmitsm.runtime.tracers import concrete, is_traced
 from jsmitsm.solution.arguments import discretized
 from jsmitsm.solution.fit import Fit
+from jsmitsm.solution.flags import scales, share
 from jsmitsm.solution.run import Run
 from jsmitsm.taylor.multi_indices import HIGHEST, multi_indices
 
 # Ratios of weights are taken for outliers beyond this factor of their median.
 OUTLIER = 2.0
+# Steps of GMRES that solve for the estimate, what they may leave of the right-hand side, and of the estimate itself.
+STEPS, LEFT, AGREED = 16, 1e-3, 0.2
+# From this order on, rows of order p + 2 of which some are trusted less may be worse than those of order p.
+HIGH, TRUSTED = 6, 0.7
+# Where a lower order sees a smaller error than these, the estimate lies so far between the two, in logarithms.
+DOUBT = 1.0 / 3.0
 
 
 @dataclass(frozen=True)
@@ -52,17 +60,19 @@ def correction(fit: Fit, values: Any) -> Correction:
     The defect of the solution in rows of order p + 2, taken through the inverse of its own
     matrix: e = A_p^-1 D (b_{p+2} - A_{p+2} u_p). D brings the rows of the two orders to one scale,
     that of the source in them, and rows of one-sided stencils count less: they amplify what order p + 2 misses itself.
+    Where the two matrices differ, that is off by as much as they do; a few steps of GMRES with the kept factors make
+    of it what leads to the solution of order p + 2.
     Solutions of other methods, whose rows are no such predictions, and of the least-squares form, whose rows have no
     common scale, are compared with that of method S of order p + 2. Held values have no error; where p + 2 is no
     better than p (no smoothness, or round-off) the estimate says little.
     """
     low = fit.discretization()
     if fit.recipe.formulation == "lsq" or fit.recipe.method != "S":
-        return _against_higher(fit, low, values)
+        return _against(fit, low, values)
     run = Run(low, fit.problem, "auto", True, False, "loo")
     nums = numbers(low, fit.problem, fit.taylor)
     classes, rows = all_rows(low, nums)
-    high, high_nums = _higher(fit, low)
+    high, high_nums = _of_order(fit, low, fit.recipe.order + 2)
     high_rows = Run(high, fit.problem, "auto", True, True, "loo").local_rows(high_nums)
     defect = _per_value(high, *high_rows, high_nums, values)
     own = _per_value(low, classes, rows, nums, values)
@@ -72,6 +82,12 @@ def correction(fit: Fit, values: Any) -> Correction:
     weighed = ratio * trust * defect[0]
     data, r, c = matrix(low, classes, rows)
     x, _ = run.solved(data, r, c, weighed.reshape(-1)[free], balanced=False)
+    if not is_traced(x, high_rows):
+        kept, more = run.factor_of(data, r, c), np.zeros(len(low.floating))
+        scale = np.asarray(ratio * trust).reshape(-1)[free]
+        size = np.broadcast_to(scales(np.asarray(values)), low.held.shape).reshape(-1)[free]
+        back = lambda v: kept.solve(np.concatenate([scale * v, more]))[: len(free)]
+        x = _refined(back, matrix(high, *high_rows), np.asarray(x), size)
 
     def spread(x: Any) -> Any:
         zero = np.zeros(low.held.size)
@@ -82,7 +98,26 @@ def correction(fit: Fit, values: Any) -> Correction:
         right = np.concatenate([weights.reshape(-1)[free], np.zeros(len(low.floating))])
         return spread(run.factor_of(data, r, c).solve(right, transpose=True)[: len(free)])
 
-    return Correction(spread(x), weighed, adjoint)
+    error = spread(x)
+    if fit.recipe.order >= HIGH and not is_traced(error, trust) and trust.min(initial=1.0) < TRUSTED:
+        error = _doubted(fit, low, values, error)
+    return Correction(error, weighed, adjoint)
+
+
+def _refined(back: Callable[[np.ndarray], np.ndarray], entries: Any, first: np.ndarray, size: np.ndarray) -> np.ndarray:
+    """What solves the equations with a matrix of these entries, from ``first`` of an approximate inverse ``back``.
+
+    size (n,): of every unknown, so that none counts for more. What does not converge stays as it was.
+    """
+    from scipy.sparse import csr_matrix
+    from scipy.sparse.linalg import LinearOperator, gmres
+
+    data, r, c = map(np.asarray, entries)
+    a, n = csr_matrix((data, (r, c)), shape=(len(first), len(first))), len(first)
+    whole = LinearOperator((n, n), matvec=lambda v: back(a @ (size * v)) / size, dtype=float)
+    x = gmres(whole, first / size, rtol=LEFT, atol=0.0, restart=STEPS, maxiter=1)[0]
+    left = np.linalg.norm(whole.matvec(x) - first / size)
+    return size * x if left <= AGREED * np.linalg.norm(x) else first
 
 
 def one_scale(mine: Any, theirs: Any, disc: Discretization, own: Any = True, median: Any = None) -> Any:
@@ -118,18 +153,41 @@ def trust_of(disc: Discretization, classes: list[Class], rows: list[Row]) -> Any
     return _put(trust, ids, part)[:, None]
 
 
-def _against_higher(fit: Fit, low: Discretization, values: Any) -> Correction:
+def _against(fit: Fit, low: Discretization, values: Any) -> Correction:
     """What leads to the solution by method S of order p + 2."""
-    high, nums = _higher(fit, low)
-    form = "lsq" if fit.recipe.formulation == "lsq" else "auto"
-    run = Run(high, fit.problem, "auto", True, form == "auto", form)
-    reference = with_held(high, nums, run.solved(*run.assembled(nums), balanced=False)[0])
-    missed = None
-    if form == "lsq" and not is_traced(reference):
+    error, missed = _towards(fit, low, values, fit.recipe.order + 2), None
+    if fit.recipe.formulation == "lsq" and not is_traced(error):
         nums = numbers(low, fit.problem, fit.taylor)
         missed = np.zeros(low.held.shape)
         missed[nums.ids] = misfit(low, nums, values)[:, None]
-    return Correction(reference - values, missed, None)
+        error = _doubted(fit, low, values, error)
+    return Correction(error, missed, None)
+
+
+def _towards(fit: Fit, low: Discretization, values: Any, order: int) -> Any:
+    """What leads from the values to the solution by method S of another order, (N, F)."""
+    other, nums = _of_order(fit, low, order)
+    form = "lsq" if fit.recipe.formulation == "lsq" else "auto"
+    run = Run(other, fit.problem, "auto", True, form == "auto", form)
+    return with_held(other, nums, run.solved(*run.assembled(nums), balanced=False)[0]) - values
+
+
+def _doubted(fit: Fit, low: Discretization, values: Any, error: Any) -> Any:
+    """The error towards order p + 2, or between it and that towards a lower order where this is smaller.
+
+    On a cloud too small or too uneven for order p + 2 this order is worse than p, and the difference tells its error,
+    not that of p; a lower order, at worst as bad as p there, is off by about as much as p. On even clouds an odd order
+    is hardly better than the even one below.
+    """
+    order = max(fit.recipe.order - 1 - fit.recipe.order % 2, 2, *low.rec.orders)
+    if order >= fit.recipe.order:
+        return error
+    try:
+        other = _towards(fit, low, values, order)
+    except SolveError:
+        return error
+    high, lower = (share(np.asarray(e), np.asarray(values)) for e in (error, other))
+    return other * (high / lower) ** DOUBT if 0.0 < lower < high else error
 
 
 def _put(array: np.ndarray, at: np.ndarray, value: Any) -> np.ndarray:
@@ -137,9 +195,8 @@ def _put(array: np.ndarray, at: np.ndarray, value: Any) -> np.ndarray:
     return array
 
 
-def _higher(fit: Fit, low: Discretization) -> tuple[Discretization, Numbers]:
-    """The same problem with method S of order p + 2 on its own stencils."""
-    order = fit.recipe.order + 2
+def _of_order(fit: Fit, low: Discretization, order: int) -> tuple[Discretization, Numbers]:
+    """The same problem with method S of another order on its own stencils."""
     if order > HIGHEST:
         raise ValueError(
             f"error_estimate: needs expansions of order p + 2 = {order}, and {HIGHEST} is the highest; solve at order "
@@ -153,13 +210,14 @@ def _higher(fit: Fit, low: Discretization) -> tuple[Discretization, Numbers]:
         )
     cloud = Cloud(np.asarray(host), low.cloud.groups, low.cloud.normals)
     depth = min(low.rec.depth, room(low.rec, order, low.traced, cloud, fit.problem.params))
-    high = discretized(fit.problem, cloud, "S", order, depth=depth)
-    high.cloud = fit.cloud
+    other = discretized(fit.problem, cloud, "S", order, depth=depth)
+    other.cloud = fit.cloud
     taylor = fit.taylor
     if taylor is not None:
-        more = len(multi_indices(low.rec.dim, high.rec.reach)) - taylor.shape[2]
-        taylor = (jnp if is_traced(taylor) else np).pad(taylor, ((0, 0), (0, 0), (0, more)))
-    return high, numbers(high, fit.problem, taylor)
+        count = len(multi_indices(low.rec.dim, other.rec.reach))
+        more = ((0, 0), (0, 0), (0, max(0, count - taylor.shape[2])))
+        taylor = (jnp if is_traced(taylor) else np).pad(taylor, more)[:, :, :count]
+    return other, numbers(other, fit.problem, taylor)
 
 
 def _per_value(disc: Discretization, classes: Any, rows: Any, nums: Numbers, values: Any) -> tuple[Any, Any]:
