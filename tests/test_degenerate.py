@@ -70,6 +70,22 @@ def test_a_condition_against_the_equation_is_told():
     assert not js.solve(problem, RADIUS, throw=False).converged
 
 
+HELD = {  # pde and the value that it has at 0 by itself
+    "euler": (lambda u, x: x[0] ** 2 * lap(u)(x) - 2.0 * u(x), 0.0),  # u = x^2
+    "euler with a source": (lambda u, x: x[0] ** 2 * lap(u)(x) + x[0] * grad(u)(x)[0] - 4.0 * u(x) + 4.0, 1.0),  # 1
+    "sphere": (lambda u, x: x[0] * lap(u)(x) + 2.0 * grad(u)(x)[0], 1.0),  # 1
+}
+
+
+@pytest.mark.parametrize("name", HELD)
+def test_a_held_value_that_the_equation_denies_is_told(name):
+    pde, value = HELD[name]
+    end = js.dirichlet(1.0)  # the solutions x^2 and 1 both have it
+    told = js.solve(js.Problem(pde, {"left": js.dirichlet(value + 2.0), "right": end}), RADIUS).flags
+    assert any("1 particle(s), first [0], contradict the equation" in flag for flag in told)
+    assert js.solve(js.Problem(pde, {"left": js.dirichlet(value), "right": end}), RADIUS).flags == []
+
+
 def test_division_by_the_radius_is_told_to_multiply():
     pde = lambda u, x: lap(u)(x) + 2.0 / x[0] * grad(u)(x)[0] + 6.0  # noqa: E731
     with pytest.raises(ValueError, match="multiply the equation by it"):

@@ -19,7 +19,7 @@ DATA = Path(__file__).parent.parent / "data" / "random.json"
 # So many cases make the sweep.
 WHOLE = 4000
 # So many cases of a recipe at a time.
-TURN = 8
+TURN = 20
 CLASSES, METHODS = ("linear", "nonlinear", "system"), ("S", "I", "II", "III", "SSPH")
 
 
@@ -72,13 +72,16 @@ def judgement(records: list[dict[str, Any]], seed: int) -> dict[str, Any]:
     right = sum(r["kind"] in ("accurate", "right, yet flagged") for r in records)
     needless = sum(r["kind"] == "right, yet flagged" for r in records)
     kinds = ", ".join(f"{sum(r['class'] == name for r in records)} {name}" for name in CLASSES)
-    part = f"Some of {WHOLE} cases, the rest has not run: " if len(records) < WHOLE else "Of these cases "
+    asked, part = max(WHOLE, len(records)), ""
+    if len(records) < asked:
+        some, every = len({r["case"] // MEMBERS for r in records}), asked // MEMBERS
+        part = f"{len(records)} of the cases have run, made by {some} of the {every} recipes: "
     note = (
-        f"`python -m benchmarks.stability --random --seed {seed} --cases {len(records)}` on {machine['processor']}, "
+        f"`python -m benchmarks.stability --random --seed {seed} --cases {asked}` on {machine['processor']}, "
         f"JAX {machine['jax']}: drawn from operators of first to fourth order with variable and steep coefficients, "
         "nonlinear ones and systems, on intervals, boxes, stars, balls, shapes with notches and holes, lattices to "
-        "random clouds, conditions of every kind, orders 2 to 8, solutions from smooth to narrower than the spacing, "
-        f"in float64. {part}{kinds}, {sum(r['dim'] == 3 for r in records)} in 3D. "
+        "random clouds, conditions of every kind, orders 2 to 8 (in 3D to 4), solutions from smooth to narrower than "
+        f"the spacing, in float64. {part}{kinds}, {sum(r['dim'] == 3 for r in records)} in 3D. "
         f"*Wrong*: an error above {WRONG:.0%} (relative L2, of the worst field); *accurate*: below {RIGHT:.0%}. "
         f"Flagged are {needless} of the {right} solutions with an error below {RIGHT:.0%} "
         f"({needless / max(right, 1):.1%})."

@@ -20,6 +20,7 @@ SYMPTOMS = {
     "of their range between neighbours": "roughness",
     "The global system is nearly singular": "singular",
     "Round-off may reach": "round-off",
+    "contradict the equation": "contradiction",
     "The part of the source": "source",
     "The coefficients of the operator change": "coefficients",
     "A coefficient of the highest derivatives jumps": "jumps",

@@ -1,4 +1,4 @@
-"""Error estimate by defect correction: the rows of a higher order, applied to the solution."""
+"""Error estimate: the rows of a higher order, applied to the solution, and solved for what they miss."""
 
 from __future__ import annotations
 
@@ -18,15 +18,21 @@ from jsmitsm.discretization.leave_one_out import matrix, right_side, with_held
 from jsmitsm.discretization.resolution.digits import room
 from jsmitsm.discretization.rows import all_rows
 from jsmitsm.particle.moments import Row
+from jsmitsm.runtime.errors import SolveError
 from jsmitsm.runtime.progress import bar
 from jsmitsm.runtime.tracers import concrete, is_traced
 from jsmitsm.solution.arguments import discretized
 from jsmitsm.solution.fit import Fit
+from jsmitsm.solution.flags import share
 from jsmitsm.solution.run import Run
 from jsmitsm.taylor.multi_indices import HIGHEST, multi_indices
 
 # Ratios of weights are taken for outliers beyond this factor of their median.
 OUTLIER = 2.0
+# From this order on, rows of order p + 2 of which some are trusted less may be worse than those of order p.
+HIGH, TRUSTED = 6, 0.7
+# Where a lower order sees a smaller error than these, the estimate lies so far between the two, in logarithms.
+DOUBT = 1.0 / 3.0
 
 
 @dataclass(frozen=True)
@@ -35,8 +41,8 @@ class Correction:
 
     error (N, F): the estimated u_exact - u, with its sign.
     defect (N, F): by how much every value misses its prediction by rows of a higher order, in the scale of u: what
-    each particle contributes to the error, which is the inverse of the global matrix times this. In the least-squares
-    form the misfit of its local fit; None for the methods other than S, which have neither.
+    each particle contributes to the error, which is about the inverse of the global matrix times this. In the
+    least-squares form the misfit of its local fit; None for the methods other than S, which have neither.
     adjoint: of weights (N, F) of the values in a number, those of the defects in it; None where there are no rows.
     """
 
@@ -49,29 +55,38 @@ class Correction:
 def correction(fit: Fit, values: Any) -> Correction:
     """The estimated error of the values (N, F), and what it comes from.
 
-    The defect of the solution in rows of order p + 2, taken through the inverse of its own
-    matrix: e = A_p^-1 D (b_{p+2} - A_{p+2} u_p). D brings the rows of the two orders to one scale,
-    that of the source in them, and rows of one-sided stencils count less: they amplify what order p + 2 misses itself.
+    The defect of the solution in rows of order p + 2, taken through the inverse of their matrix,
+
+        e = A_{p+2}^-1 (b_{p+2} - A_{p+2} u_p),
+
+    is what leads to the solution of order p + 2, or of a lower one where that knows nothing more (see ``compared``).
+    Where that matrix is singular, and for those who ask what each particle contributes, the defect is taken through
+    the solution's own: A_p^-1 D (b_{p+2} - A_{p+2} u_p). D brings the rows of the two orders to one scale, that of the
+    source in them, and rows of one-sided stencils count less: they amplify what order p + 2 misses itself.
     Solutions of other methods, whose rows are no such predictions, and of the least-squares form, whose rows have no
     common scale, are compared with that of method S of order p + 2. Held values have no error; where p + 2 is no
     better than p (no smoothness, or round-off) the estimate says little.
     """
     low = fit.discretization()
     if fit.recipe.formulation == "lsq" or fit.recipe.method != "S":
-        return _against_higher(fit, low, values)
+        return _against(fit, low, values)
     run = Run(low, fit.problem, "auto", True, False, "loo")
     nums = numbers(low, fit.problem, fit.taylor)
     classes, rows = all_rows(low, nums)
-    high, high_nums = _higher(fit, low)
-    high_rows = Run(high, fit.problem, "auto", True, True, "loo").local_rows(high_nums)
+    order = _beside(fit, low)
+    high, high_nums = _of_order(fit, low, order)
+    above = Run(high, fit.problem, "auto", True, True, "loo")
+    high_rows = above.local_rows(high_nums)
     defect = _per_value(high, *high_rows, high_nums, values)
     own = _per_value(low, classes, rows, nums, values)
     free = np.flatnonzero(~low.held.reshape(-1))
-    ratio = one_scale(own[1], defect[1], low)
-    trust = trust_of(high, *high_rows)
-    weighed = ratio * trust * defect[0]
+    trust = _trust(high, *high_rows)
+    weighed = _one_scale(own[1], defect[1], low) * trust * defect[0]
     data, r, c = matrix(low, classes, rows)
-    x, _ = run.solved(data, r, c, weighed.reshape(-1)[free], balanced=False)
+    try:
+        x, _ = above.solved(*matrix(high, *high_rows), defect[0].reshape(-1)[free], balanced=False)
+    except SolveError:
+        x, _ = run.solved(data, r, c, weighed.reshape(-1)[free], balanced=False)
 
     def spread(x: Any) -> Any:
         zero = np.zeros(low.held.size)
@@ -82,13 +97,15 @@ def correction(fit: Fit, values: Any) -> Correction:
         right = np.concatenate([weights.reshape(-1)[free], np.zeros(len(low.floating))])
         return spread(run.factor_of(data, r, c).solve(right, transpose=True)[: len(free)])
 
-    return Correction(spread(x), weighed, adjoint)
+    error = spread(x)
+    if order > fit.recipe.order >= HIGH and not is_traced(error, trust) and trust.min(initial=1.0) < TRUSTED:
+        error = _doubted(fit, low, values, error)
+    return Correction(error, weighed, adjoint)
 
 
-def one_scale(mine: Any, theirs: Any, disc: Discretization, own: Any = True, median: Any = None) -> Any:
+def _one_scale(mine: Any, theirs: Any, disc: Discretization) -> Any:
     """The ratios (N, F) of the weights that the source has in the rows of both orders, without outliers.
 
-    own (N,): the particles that have rows, and median: of the whole cloud's, where this is a part of one.
     A row with a condition of its own hardly hangs on the source, whose weights may vanish there in one of the two.
     """
     xp = jnp if is_traced(mine, theirs) else np
@@ -97,15 +114,15 @@ def one_scale(mine: Any, theirs: Any, disc: Discretization, own: Any = True, med
     typical = xp.ones(ratio.shape)
     for some in (disc.n_own == 0, disc.n_own > 0):
         for f in range(ratio.shape[1]):
-            ids = np.flatnonzero(some & ~disc.held[:, f] & own)
-            if len(ids) or median is not None:
+            ids = np.flatnonzero(some & ~disc.held[:, f])
+            if len(ids):
                 typical = xp.where((np.isin(np.arange(len(ratio)), ids))[:, None] & (np.arange(ratio.shape[1]) == f),
-                                   (median or xp.median)(ratio[ids, f]), typical)  # fmt: skip
+                                   xp.median(ratio[ids, f]), typical)  # fmt: skip
     part = ratio / typical
     return typical * xp.where(part > 0, xp.clip(part, 1.0 / OUTLIER, OUTLIER), 1.0)
 
 
-def trust_of(disc: Discretization, classes: list[Class], rows: list[Row]) -> Any:
+def _trust(disc: Discretization, classes: list[Class], rows: list[Row]) -> Any:
     """How far the rows of the higher order are trusted, (N, 1): those of one-sided stencils amplify what they miss."""
     traced = is_traced(rows)
     xp = jnp if traced else np
@@ -118,18 +135,69 @@ def trust_of(disc: Discretization, classes: list[Class], rows: list[Row]) -> Any
     return _put(trust, ids, part)[:, None]
 
 
-def _against_higher(fit: Fit, low: Discretization, values: Any) -> Correction:
+def _against(fit: Fit, low: Discretization, values: Any) -> Correction:
     """What leads to the solution by method S of order p + 2."""
-    high, nums = _higher(fit, low)
-    form = "lsq" if fit.recipe.formulation == "lsq" else "auto"
-    run = Run(high, fit.problem, "auto", True, form == "auto", form)
-    reference = with_held(high, nums, run.solved(*run.assembled(nums), balanced=False)[0])
-    missed = None
-    if form == "lsq" and not is_traced(reference):
+    order, missed = _beside(fit, low), None
+    error = _towards(fit, low, values, order)
+    if fit.recipe.formulation == "lsq" and not is_traced(error):
         nums = numbers(low, fit.problem, fit.taylor)
         missed = np.zeros(low.held.shape)
         missed[nums.ids] = misfit(low, nums, values)[:, None]
-    return Correction(reference - values, missed, None)
+        error = error if order < fit.recipe.order else _doubted(fit, low, values, error)
+    return Correction(error, missed, None)
+
+
+def _towards(fit: Fit, low: Discretization, values: Any, order: int) -> Any:
+    """What leads from the values to the solution by method S of another order, (N, F)."""
+    other, nums = _of_order(fit, low, order)
+    form = "lsq" if fit.recipe.formulation == "lsq" else "auto"
+    run = Run(other, fit.problem, "auto", True, form == "auto", form)
+    return with_held(other, nums, run.solved(*run.assembled(nums), balanced=False)[0]) - values
+
+
+def _doubted(fit: Fit, low: Discretization, values: Any, error: Any) -> Any:
+    """The error towards order p + 2, or between it and that towards a lower order where this is smaller.
+
+    On a cloud too small or too uneven for order p + 2 this order is worse than p, and the difference tells its error,
+    not that of p; a lower order, at worst as bad as p there, is off by about as much as p. Under a JAX transform nobody
+    is asked again.
+    """
+    order = lower(fit.recipe.order, max(low.rec.orders))
+    if order == fit.recipe.order:
+        return error
+    try:
+        other = _towards(fit, low, values, order)
+    except SolveError:
+        return error
+    far, near = (share(np.asarray(e), np.asarray(values)) for e in (error, other))
+    return other * (far / near) ** DOUBT if 0.0 < near < far else error
+
+
+def lower(order: int, least: int) -> int:
+    """A lower order whose errors are larger, itself where there is none; on even clouds odd orders are those below."""
+    return min(order, max(order - 1 - order % 2, 2, least))
+
+
+def compared(order: int, depth: int, most: int, least: int) -> int:
+    """The order whose solution tells the error of one of this order and depth: p + 2, or a lower one.
+
+    most : by how many degrees the recursion of order p + 2 may go deeper; least : the equation's order.
+    In one dimension, and along characteristics, the equation gives all of the coefficients but a few, and solutions of
+    two orders whose recursions end at the same degree are one and the same.
+    """
+    deeper = order + 2 + min(depth, most) > order + depth
+    below = lower(order, least)
+    return order + 2 if deeper or below == order else below
+
+
+def _beside(fit: Fit, low: Discretization) -> int:
+    """The order whose solution is compared with."""
+    order = fit.recipe.order
+    host = concrete(fit.cloud.points)
+    if host is None:
+        return order + 2  # told where the stencils are made
+    most = room(low.rec, order + 2, low.traced, low.cloud, fit.problem.params)
+    return compared(order, low.rec.depth, most, max(low.rec.orders))
 
 
 def _put(array: np.ndarray, at: np.ndarray, value: Any) -> np.ndarray:
@@ -137,9 +205,8 @@ def _put(array: np.ndarray, at: np.ndarray, value: Any) -> np.ndarray:
     return array
 
 
-def _higher(fit: Fit, low: Discretization) -> tuple[Discretization, Numbers]:
-    """The same problem with method S of order p + 2 on its own stencils."""
-    order = fit.recipe.order + 2
+def _of_order(fit: Fit, low: Discretization, order: int) -> tuple[Discretization, Numbers]:
+    """The same problem with method S of another order on its own stencils."""
     if order > HIGHEST:
         raise ValueError(
             f"error_estimate: needs expansions of order p + 2 = {order}, and {HIGHEST} is the highest; solve at order "
@@ -153,13 +220,14 @@ def _higher(fit: Fit, low: Discretization) -> tuple[Discretization, Numbers]:
         )
     cloud = Cloud(np.asarray(host), low.cloud.groups, low.cloud.normals)
     depth = min(low.rec.depth, room(low.rec, order, low.traced, cloud, fit.problem.params))
-    high = discretized(fit.problem, cloud, "S", order, depth=depth)
-    high.cloud = fit.cloud
+    other = discretized(fit.problem, cloud, "S", order, depth=depth)
+    other.cloud = fit.cloud
     taylor = fit.taylor
     if taylor is not None:
-        more = len(multi_indices(low.rec.dim, high.rec.reach)) - taylor.shape[2]
-        taylor = (jnp if is_traced(taylor) else np).pad(taylor, ((0, 0), (0, 0), (0, more)))
-    return high, numbers(high, fit.problem, taylor)
+        count = len(multi_indices(low.rec.dim, other.rec.reach))
+        more = ((0, 0), (0, 0), (0, max(0, count - taylor.shape[2])))
+        taylor = (jnp if is_traced(taylor) else np).pad(taylor, more)[:, :, :count]
+    return other, numbers(other, fit.problem, taylor)
 
 
 def _per_value(disc: Discretization, classes: Any, rows: Any, nums: Numbers, values: Any) -> tuple[Any, Any]:
@@ -173,7 +241,7 @@ def _per_value(disc: Discretization, classes: Any, rows: Any, nums: Numbers, val
     au = xp.zeros(len(free)).at[r].add(data * u[c]) if traced else np.bincount(r, data * u[c], len(free))
     residual, weight = xp.zeros(disc.held.size), xp.ones(disc.held.size)
     first = np.array(disc.rec.equation_rows)
-    parts = [strongest(xp.asarray(row.source)[:, :, first], xp) for row in rows]
+    parts = [_strongest(xp.asarray(row.source)[:, :, first], xp) for row in rows]
     ids = np.concatenate([cls.ids for cls in classes])
     strength = xp.concatenate(parts)
     if traced:
@@ -185,7 +253,7 @@ def _per_value(disc: Discretization, classes: Any, rows: Any, nums: Numbers, val
     return residual.reshape(disc.held.shape), weight
 
 
-def strongest(weights: Any, xp: Any) -> Any:
+def _strongest(weights: Any, xp: Any) -> Any:
     """Of each row's weights of the sources (n, F, E), the largest in size: (n, F)."""
     place = xp.argmax(xp.abs(weights), axis=2)
     return xp.take_along_axis(weights, place[..., None], axis=2)[..., 0]

@@ -18,6 +18,7 @@ import numpy as np
 from jsmitsm.discretization.health import LEBESGUE
 from jsmitsm.discretization.leave_one_out import right_side
 from jsmitsm.discretization.operator_kind import cell_peclet, mean_spacing, usual_condition, wave_number
+from jsmitsm.discretization.resolution.contradictions import contradictions
 from jsmitsm.discretization.resolution.steepness import steepness, unseen
 from jsmitsm.discretization.rows import all_rows
 from jsmitsm.runtime.errors import some
@@ -64,6 +65,8 @@ CLEAR_WAVE = 0.1  # of PHASE
 COEFFICIENT = 0.3
 # By so much more its series has nothing to do with a coefficient, and all orders agree on another problem.
 DIVERGENT = 100.0
+# Where it degenerates, the equation is missed at a held value by this part of its largest terms.
+CONTRADICTED = 0.05
 # The estimate passes through the same inverse: of a condition so many times the usual one it can tell nothing.
 BLIND = 1e6
 # Beyond so many particles an error estimate would cost more than a look at the flags may.
@@ -82,7 +85,7 @@ def flags(run: Any, values: Any, nums: Any, estimated: Callable[[], float]) -> t
     certain: list[str] = []
     doubts: list[str] = []
     found: dict[str, float] = {}
-    for test in (_round_off, _far_away, _jumps):
+    for test in (_round_off, _far_away, _jumps, _contradictions):
         test(run, values, nums, certain, found)
     for test in (_condition, _misfit, _waves, _roughness, _source, _coefficients, _weakness, _peclet):
         test(run, values, nums, doubts, found)
@@ -259,6 +262,20 @@ def _jumps(run: Any, values: np.ndarray, nums: Any, out: list[str], found: dict[
         )
 
 
+def _contradictions(run: Any, values: np.ndarray, nums: Any, out: list[str], found: dict[str, float]) -> None:
+    if np.shape(nums.jac)[-1] == 1:
+        return
+    off = contradictions(run.disc, nums, run.problem, values)
+    found["contradiction"] = float(off.max(initial=0.0))
+    bad = np.flatnonzero(off > CONTRADICTED)
+    if len(bad):
+        out.append(
+            f"The values held at {len(bad)} particle(s), first {some(bad)}, contradict the equation, whose highest "
+            "derivatives have no weight there and which fixes u, or its slope, by itself: correct them, or give "
+            "js.free() where the equation needs no condition."
+        )
+
+
 def _weakness(run: Any, values: np.ndarray, nums: Any, out: list[str], found: dict[str, float]) -> None:
     if run.rows is None:
         return
@@ -331,4 +348,4 @@ def _far_away(run: Any, values: np.ndarray, nums: Any, out: list[str], found: di
 
 # The tests that ask the whole system, and those that ask one region of several alone.
 OF_THE_WHOLE = (_round_off, _condition, _far_away)
-OF_A_REGION = (_jumps, _waves, _roughness, _coefficients, _peclet)
+OF_A_REGION = (_jumps, _contradictions, _waves, _roughness, _coefficients, _peclet)

@@ -117,9 +117,10 @@ class Solution(Anywhere):
 
     @explaining
     def error_estimate(self) -> Array:
-        """Estimated error |u - u_exact| at every particle, by defect correction.
+        """Estimated error |u - u_exact| at every particle: what leads to the solution of order p + 2.
 
-        Computed when asked for: one more assembly at order p + 2 and one solve with the kept factors.
+        Computed when asked for: one more assembly at order p + 2 and one more solve. Where rows of that order are weak,
+        and in the least-squares form, a lower order is asked too.
 
         Returns
         -------

@@ -1,0 +1,56 @@
+"""The error estimate: what it is, and that it knows the error where one order knows no more than another."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jsmitsm as js
+from jsmitsm.solution.estimate import compared, lower
+
+
+def peak(x):
+    return 1.0 + 1.0 / (1.0 + 30.0 * (x[0] - 0.4) ** 2)
+
+
+def variable(u, x):
+    return js.divergence(lambda y: (1.0 + 0.4 * jnp.sin(3.0 * y[0])) * js.grad(u)(y))(x)
+
+
+def first_order(u, x):
+    return js.grad(u)(x)[0] + u(x)
+
+
+def carried(u, x):
+    """The convection between neighbours is 20 times the diffusion."""
+    return js.grad(u)(x)[0] - 1.0 / 320.0 * js.laplacian(u)(x)
+
+
+def solved(operator, n, right=None, **options):
+    held = js.dirichlet(peak)
+    pde = lambda u, x: operator(u, x) - operator(peak, x)  # noqa: E731
+    return js.solve(js.Problem(pde, {"left": held, "right": right or held}), js.interval(0.0, 1.0, n), **options)
+
+
+def test_it_is_the_way_to_the_solution_of_the_next_order():
+    sol = solved(variable, 15)
+    next_one = solved(variable, 15, order=6, depth=sol.depth)
+    np.testing.assert_allclose(sol.error_estimate(), np.abs(next_one.u - sol.u), rtol=1e-6, atol=1e-12)
+
+
+@pytest.mark.parametrize("order", [4, 5, 6, 8])
+@pytest.mark.parametrize("operator", [first_order, carried])
+def test_recursions_that_end_at_one_degree_are_not_compared(operator, order):
+    """Orders 6 and 8 of a first-order equation have recursions to degree 10: one solution in 1D, an estimate of 0."""
+    sol = solved(operator, 17, right=js.free() if operator is first_order else None, order=order)
+    error = np.linalg.norm(sol.u - jax.vmap(peak)(sol.cloud.points))
+    assert error > 1e-7
+    assert 0.3 < np.linalg.norm(sol.error_estimate()) / error < 10.0
+
+
+def test_which_order_is_compared_with():
+    assert compared(order=4, depth=4, most=20, least=2) == 6
+    assert compared(order=6, depth=4, most=2, least=1) == 5  # both end at 10
+    assert compared(order=4, depth=4, most=2, least=2) == 3
+    assert compared(order=4, depth=4, most=2, least=4) == 6  # a beam has no lower one
+    assert [lower(p, 2) for p in range(2, 9)] == [2, 2, 3, 3, 5, 5, 7]
