@@ -12,7 +12,7 @@ from jsmitsm.evolution.evolution import Evolution
 from jsmitsm.evolution.gradient.adjoint import Plan, states
 from jsmitsm.evolution.gradient.inputs import Inputs, Push
 from jsmitsm.evolution.run import Run, drifted
-from jsmitsm.evolution.space.semidiscrete import Semidiscrete
+from jsmitsm.evolution.space.semidiscrete import Semidiscrete, centred
 from jsmitsm.evolution.steps import dense_output
 from jsmitsm.evolution.steps.tableaux import Additive, Radau
 from jsmitsm.runtime.tracers import is_traced
@@ -86,20 +86,21 @@ def _saved(semi: Semidiscrete, parts: np.ndarray, steps: int, m: int, found: Any
     index, weights = dense_output.weights(np.linspace(0.0, 1.0, steps + 1), parts)
     at = np.round(index * m).astype(int)  # samples at the ends of steps
     size, out = semi.system.n, []
-    places = semi.free, semi.held, semi.disc.partner
+    places: Any = semi.free, semi.held, semi.disc.partner
+    static: Any = {"fields": semi.fields, "floating": semi.floating}
     for part, given in zip((slice(None, size), slice(size, None)), held):
-        out.append(_interpolated(found[:, part], given, weights, index, at, *places, fields=semi.fields))
+        out.append(_interpolated(found[:, part], given, weights, index, at, *places, **static))
     return out if semi.second else [*out, None]
 
 
-@partial(in_one_program, static=("fields",))
+@partial(in_one_program, static=("fields", "floating"))
 def _interpolated(found: Any, held_values: Any, weights: Any, index: Any, at: Any, free: Any, held: Any, partner: Any,
-                  fields: int) -> Any:  # fmt: skip
+                  fields: int, floating: int | None) -> Any:  # fmt: skip
     """All values from the free ones (K + 1, n) and the held ones (held, samples) of the steps around saved times."""
     mine = jnp.einsum("sk,skn->sn", weights, jnp.asarray(found)[index])
     given = jnp.einsum("sk,skn->sn", weights, jnp.asarray(held_values).T[at])
     flat = jnp.zeros((len(index), len(partner) * fields)).at[:, free].set(mine).at[:, held].set(given)
-    return flat.reshape(len(index), -1, fields)[:, partner]
+    return centred(flat.reshape(len(index), -1, fields)[:, partner], floating)
 
 
 def _started(run: Run, samples: list[Any], force: Any, jump: Any, h: Any, still: np.ndarray) -> Any:
@@ -115,7 +116,15 @@ def _started(run: Run, samples: list[Any], force: Any, jump: Any, h: Any, still:
         if gap <= 1e-13 * np.abs(np.asarray(flat[0])).max(initial=0.0):
             return y
     moved = semi.masses_held[-1].times(flat[-1][semi.held]) - jump
-    if run.algebraic or still.any():
-        small = 1e-7 * h
+    small = 1e-7 * h
+    if run.algebraic:
+        resolvent, t = semi.system.resolvent(small), run.t[0] + small
+        later = semi.samples(jnp.reshape(t, 1))
+        forces, jumps = semi.forces(*later)
+        for jumped, f, at, known in ((moved, force, run.t[0], samples[0]), (jump - jumps[0], forces[0], t, later[0])):
+            f = f if semi.linear else f + semi.explicit(y, at, known[:, 0])
+            y = resolvent.solve(semi.system.mass(y) + jumped + small * f)
+        return y
+    if still.any():
         return semi.system.resolvent(small).solve(semi.system.mass(y) + moved + small * force)
     return y + semi.system.resolvent(jnp.asarray(0.0)).solve(moved)
