@@ -1,13 +1,14 @@
 """Evolutions against known ones, other packages beside them: ``python -m benchmarks.evolution [names] [--quick]``.
 
-Names: heat, grid, orders, random, impulse, front, burgers, wave, grayscott, taylorgreen, flow, cost, gradient, large; all but the
-last without any. Each writes its part of benchmarks/data/evolution.json.
+Names: heat, grid, orders, random, impulse, front, burgers, wave, grayscott, taylorgreen, flow, cost, gradient, large;
+all but the last without any. Each writes its part of benchmarks/data/evolution.json.
 
-heat, grid, orders, random, cost: u_t = laplacian(u) + s with the answer exp(x - t/2) sin(2 y + t), which its boundary knows;
-on the unit disk, on the square, and on uniformly random particles of it. impulse: u = 1 in a disk that is held at 0, against
-its Bessel series. front: a bistable travelling wave. burgers: u_t + u (u_x + u_y) = 0.1 laplacian(u). wave: a standing
-wave of a square membrane over 20 periods. grayscott: two reacting fields on a periodic square, against a Fourier
-spectral reference of 128 x 128 points. taylorgreen: the vortex's stream function, from whose gradient velocities come.
+heat, grid, orders, random, cost: u_t = laplacian(u) + s with the answer exp(x - t/2) sin(2 y + t), which its boundary
+knows; on the unit disk, on the square, and on uniformly random particles of it. impulse: u = 1 in a disk that is held
+at 0, against its Bessel series. front: a bistable travelling wave. burgers: u_t + u (u_x + u_y) = 0.1 laplacian(u).
+wave: a standing wave of a square membrane over 20 periods. grayscott: two reacting fields on a periodic square, against
+a Fourier spectral reference of 128 x 128 points. taylorgreen: the vortex's stream function, from whose gradient
+velocities come.
 flow: the same vortex, and a cavity from rest, in velocities and pressure; errors are those of the velocities.
 gradient: what jax.value_and_grad costs beside a forward run. large: 100,489 particles, 100 steps.
 
@@ -366,9 +367,9 @@ def large(quick: bool) -> Iterator[Line]:
 
 
 CASES: dict[str, Callable[[bool], Iterator[Line]]] = {
-    "heat": heat, "grid": grid, "orders": orders, "random": random, "impulse": impulse, "front": front, "burgers": burgers,
-    "wave": wave, "grayscott": grayscott, "taylorgreen": taylorgreen, "flow": flow, "cost": cost, "gradient": gradient,
-    "large": large,
+    "heat": heat, "grid": grid, "orders": orders, "random": random, "impulse": impulse, "front": front,
+    "burgers": burgers, "wave": wave, "grayscott": grayscott, "taylorgreen": taylorgreen, "flow": flow, "cost": cost,
+    "gradient": gradient, "large": large,
 }  # fmt: skip
 
 

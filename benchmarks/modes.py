@@ -7,7 +7,8 @@ disk, free: -laplacian(u) = lambda u on the unit disk, u or its normal derivativ
 clamped square, against sqrt(lambda) = 35.98519. ball: the unit ball, pi^2. elastic: a square between rollers,
 whose waves are known. mass: div(a grad u) with mass 1 + x y, against order 8 on 2209 particles. spectra: the
 largest real part of the eigenvalues of B^-1 A, of L = laplacian, on clouds of about 400 particles; none may be
-above 1e-6. flow: the same of Stokes' equations, with div u = 0 and with an equation for the pressure. Elements: scikit-fem's P2 on triangles with curved sides (isoparametric) on the disk.
+above 1e-6. flow: the same of Stokes' equations, with div u = 0 and with an equation for the pressure.
+Elements: scikit-fem's P2 on triangles with curved sides (isoparametric) on the disk.
 """
 
 from __future__ import annotations
@@ -220,7 +221,8 @@ def flows(quick: bool) -> Iterator[dict[str, Any]]:
         names = [name for name in cloud.groups if name != "interior"]
         for what, pde, conditions in (("div u = 0", constrained, walls), ("pressure equation", reduced, free)):
             for order in (4,) if quick else (4, 6):
-                yield flow_spectrum(kind, what, cloud, js.Problem(pde, dict.fromkeys(names, conditions), fields=3), order)
+                problem = js.Problem(pde, dict.fromkeys(names, conditions), fields=3)
+                yield flow_spectrum(kind, what, cloud, problem, order)
 
 
 def flow_spectrum(kind: str, what: str, cloud: js.Cloud, problem: js.Problem, order: int) -> dict[str, Any]:
@@ -266,8 +268,10 @@ def flow_table(lines: list[dict[str, Any]]) -> dict[str, Any]:
     """The spectra of flow."""
     rows = [[out["conditions"], out["cloud"], out["order"], out["unknowns"], out["unstable"], f"{out['largest']:.3g}"]
             for out in lines]  # fmt: skip
-    note = ("Modes of Stokes' equations between walls (`python -m benchmarks.modes flow`): those of the square begin at "
-            "-52.3, those of the disk at -14.7; a divergence that diffuses begins at -49.3, and -14.7 on the disk.")  # fmt: skip
+    note = (
+        "Modes of Stokes' equations between walls (`python -m benchmarks.modes flow`): those of the square begin at "
+        "-52.3, those of the disk at -14.7; a divergence that diffuses begins at -49.3, on the disk at -14.7."
+    )
     return {"columns": ["third equation", "particles", "order", "unknowns", "growing modes", "largest real part"],
             "rows": rows, "note": note}  # fmt: skip
 

@@ -90,7 +90,7 @@ def started(run: Run, h: float) -> np.ndarray:
     gap = np.abs(flat[0][semi.held] - np.asarray(semi.sample(np.asarray(t0))[0])).max(initial=0.0)
     still = semi.system.undriven()
     small = 1e-7 * h
-    if run.algebraic:  # a vanishing step of backward Euler takes the impulse, another settles what holds at every moment
+    if run.algebraic:  # a vanishing step of backward Euler takes the impulse, another settles what holds always
         resolvent, mass = semi.system.resolvent(small), semi.system.mass
         y = resolvent.solve(mass(y) + jump + small * force)
         force, later = _now(run, t0 + small, y)
@@ -123,10 +123,10 @@ def _equal(run: Run, y: np.ndarray, times: np.ndarray, history: History, shown: 
             stepper = run.stepper(run.semi)
             step = stepper.first(step.y, float(times[k]))
         step = _one(run, stepper, step, float(times[k]), h, k in wanted)
+        _refuse_growth(history, step.y[: run.semi.system.n], float(times[k + 1]))
         history.add(float(times[k + 1]), step, k + 1)
         if k in wanted:
             history.in_time.add(stepper, step, float(times[k + 1]), h, wanted[k])
-        _refuse_growth(history, step, float(times[k + 1]))
         run.counts["steps"] += 1
         shown.update()
 
@@ -143,11 +143,11 @@ def _one(run: Run, stepper: Any, step: Step, t: float, h: float, look: bool) -> 
         raise Stopped(f"the stage's system at t = {t:.6g} cannot be solved: {fault}") from fault
 
 
-def _refuse_growth(history: History, step: Step, t: float) -> None:
-    first = max(float(np.abs(history.states[0]).max(initial=0.0)), 1.0)
-    if history.scale > BLOWN * first:
+def _refuse_growth(history: History, values: np.ndarray, t: float) -> None:
+    first, size = max(float(np.abs(history.states[0]).max(initial=0.0)), 1.0), float(np.abs(values).max(initial=0.0))
+    if size > BLOWN * first:
         raise Stopped(
-            f"the solution blew up: it is {history.scale:.1e} at t = {t:.6g}; take more steps, or, where the equation "
+            f"the solution blew up: it is {size:.1e} at t = {t:.6g}; take more steps, or, where the equation "
             "itself grows so fast, an earlier end"
         )
 

@@ -81,7 +81,8 @@ class Run:
             return asked
         if timed.linear:
             return "radau" if self.order >= 6 or self.second or self.algebraic else "esdirk"
-        return "esdirk" if timed.quasilinear or self.algebraic else "imex"
+        # Second derivatives and higher ones that are nonlinear are too stiff to be taken explicitly.
+        return "esdirk" if timed.quasilinear or self.algebraic or max(timed.rest.order) > 1 else "imex"
 
     def _damping(self, asked: Any) -> float:
         """The factor of the damping matrix."""

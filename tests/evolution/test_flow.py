@@ -12,7 +12,7 @@ SIDES = ("left", "right", "bottom", "top")
 
 
 def exact(x, t):
-    """A polynomial flow of degree 3, the curl of x^2 y^2, and a pressure, growing in time; the pressure's mean varies."""
+    """A polynomial flow of degree 3, the curl of x^2 y^2, and a pressure whose mean varies, growing in time."""
     return (1 + t) * jnp.stack([2 * x[0] ** 2 * x[1], -2 * x[0] * x[1] ** 2, x[0] * x[1] + x[1] ** 2])
 
 
@@ -57,7 +57,7 @@ def test_polynomial_flows_are_exact(convection):
 
 
 def test_the_divergence_dies_out_in_many_small_steps():
-    """Modes that leave the constraint are damped: they would show after many steps, which L-stable schemes do not hide."""
+    """Modes that leave the constraint would show after many small steps, which no L-stable scheme hides."""
     still = dict.fromkeys(SIDES, [js.dirichlet(0.0, field=k) for k in (0, 1)])
     noise = np.random.default_rng(0).normal(size=(len(SQUARE), 3))
     problem = js.Problem(lambda u, x, t: jnp.append(momentum(u, x, t, 1.0), js.divergence(u[:2])(x)), still, fields=3)

@@ -69,8 +69,8 @@ def flag_divergence(semi: Semidiscrete, start: Any, flags: list[str]) -> None:
     size, left = float(np.abs(slopes).max()), float(np.abs(np.trace(slopes)).max())
     if left > DIVERGENT * size:
         flags.append(
-            f"The start is not free of divergence: div u is up to {left / size:.0%} of the largest slope; it diffuses as "
-            "the velocities do, and the pressure answers to it."
+            f"The start is not free of divergence: div u is up to {left / size:.0%} of the largest slope; it diffuses "
+            "as the velocities do, and the pressure answers to it."
         )
 
 
