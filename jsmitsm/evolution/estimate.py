@@ -55,11 +55,12 @@ def _integrated(
 
 
 def _summed(semi: Semidiscrete, high: Semidiscrete, steps: Any, values: Any, rates: Any, grid: np.ndarray) -> np.ndarray:
-    """The same where nothing dies out, as in Schroedinger's equation: the sizes of E^-1 misfit, added up.
+    """The same where nothing dies out, as in Schroedinger's equation: the sizes of (E + h A)^-1 misfit, added up.
 
-    There the misfit turns with the solution, and backward Euler would damp what adds up.
+    There the misfit turns with the solution, and backward Euler over long steps would damp what adds up; over h, a
+    step of the run, it takes out what turns too fast to add up.
     """
-    solve, sizes = high.system.resolvent(0.0).solve, []
+    solve, sizes = high.system.resolvent(float(np.diff(steps).mean())).solve, []
     for t in grid:
         found = high.placed(solve(_misfit(semi, high, steps, values, rates, float(t))), np.zeros(len(high.held)))
         sizes.append(np.broadcast_to(np.linalg.norm(found, axis=1, keepdims=True), found.shape))
