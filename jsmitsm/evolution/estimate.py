@@ -54,7 +54,9 @@ def _integrated(
     return np.stack(out)
 
 
-def _summed(semi: Semidiscrete, high: Semidiscrete, steps: Any, values: Any, rates: Any, grid: np.ndarray) -> np.ndarray:
+def _summed(
+    semi: Semidiscrete, high: Semidiscrete, steps: Any, values: Any, rates: Any, grid: np.ndarray
+) -> np.ndarray:
     """The same where nothing dies out, as in Schroedinger's equation: the sizes of (E + h A)^-1 misfit, added up.
 
     There the misfit turns with the solution, and backward Euler over long steps would damp what adds up; over h, a
