@@ -155,3 +155,88 @@ def differences(start: Callable[[Any], Any], spread: Any, feed: float, kill: flo
     spent = time.perf_counter() - began
     error = np.abs(np.stack([f.data.reshape(-1) for f in found], axis=1) - exact(centres)).max()
     return float(error), spent, int(told["solver"]["steps"])
+
+
+def heated_grid(warm: Any, source: Any, n: int) -> tuple[float, float, int] | None:
+    """Heat on the unit square with Dirichlet data in time by py-pde: what ``differences`` returns.
+
+    Of py-pde's steppers the explicit one with adaptive steps; the data of the boundary are expressions of x, y, t.
+    """
+    try:
+        import pde
+    except ImportError:
+        print("py-pde is not installed: its lines are left out")
+        return None
+    grid = pde.CartesianGrid([[0, 1], [0, 1]], [n, n])
+    centres = grid.cell_coords.reshape(-1, 2)
+    start = np.asarray(jax.vmap(lambda x: warm(x, 0.0))(jnp.asarray(centres))).reshape(n, n)
+    answer = "exp(x - t / 2) * sin(2 * y + t)"
+    rhs = pde.PDE({"u": f"laplace(u) + 2.5 * {answer} + exp(x - t / 2) * cos(2 * y + t)"},
+                  bc={side: {"value_expression": answer} for side in ("x-", "x+", "y-", "y+")})  # fmt: skip
+    at = jnp.asarray(centres)
+    made = np.asarray(jax.vmap(lambda x: source(x, 0.3))(at))
+    said = np.asarray(jax.vmap(lambda x: 2.5 * warm(x, 0.3) + jnp.exp(x[0] - 0.15) * jnp.cos(2 * x[1] + 0.3))(at))
+    assert np.abs(made - said).max() < 1e-12  # the expression is the source
+    began = time.perf_counter()
+    found, told = rhs.solve(pde.ScalarField(grid, start), 1.0, dt=1e-4, solver="runge-kutta", adaptive=True,
+                            tolerance=1e-6, tracker=None, ret_info=True)  # fmt: skip
+    spent = time.perf_counter() - began
+    exact = np.asarray(jax.vmap(lambda x: warm(x, 1.0))(at))
+    return float(np.abs(found.data.reshape(-1) - exact).max()), spent, int(told["solver"]["steps"])
+
+
+# --------------------------------------------------------------------------------------- a cavity's start
+
+
+def started_cavity(nu: float, end: float, degree: int = 16) -> Callable[[np.ndarray], np.ndarray]:
+    """Velocities (N, 2) of fluid at rest in the unit square at t = end, its lid moving with 16 x^2 (1 - x)^2 from 0 on.
+
+    The stream function psi = lid(x) y^2 (y - 1) + sum c_ij f_i(x) f_j(y), f_k clamped polynomials, by Galerkin's
+    method: int grad psi_t . grad f = -int nu lap psi lap f - int lap psi (psi_y f_x - psi_x f_y).
+    """
+    from numpy.polynomial import Polynomial
+    from numpy.polynomial.legendre import Legendre, leggauss
+    from scipy.integrate import solve_ivp
+    from scipy.linalg import cho_factor, cho_solve
+
+    s, w = leggauss(2 * degree + 8)
+    s, w = (s + 1) / 2, w / 2
+    clamped = Polynomial([0, 0, 16, -32, 16])  # 16 s^2 (1 - s)^2
+    basis = [clamped * Legendre.basis(k, domain=[0, 1]).convert(kind=Polynomial, domain=[-1, 1]) for k in range(degree)]
+    lift = Polynomial([0, 0, -1, 1])
+
+    def at(polynomials: list[Any], points: np.ndarray) -> list[np.ndarray]:
+        """Values, first and second derivatives (points, k)."""
+        return [np.stack([p.deriv(m)(points) if m else p(points) for p in polynomials], axis=1) for m in range(3)]
+
+    f, lid, rise = at(basis, s), [v[:, 0] for v in at([clamped], s)], [v[:, 0] for v in at([lift], s)]
+    weight = np.outer(w, w)
+
+    def field(c: np.ndarray, a: int, b: int) -> np.ndarray:
+        return f[a] @ c @ f[b].T + np.outer(lid[a], rise[b])
+
+    def tested(values: np.ndarray, a: int, b: int) -> np.ndarray:
+        return f[a].T @ (weight * values) @ f[b]
+
+    one, two = (f[m].T @ (w[:, None] * f[m]) for m in (0, 1))
+    mass = cho_factor(np.kron(two, one) + np.kron(one, two))
+
+    def rate(_: float, flat: np.ndarray) -> np.ndarray:
+        c = flat.reshape(degree, degree)
+        lap = field(c, 2, 0) + field(c, 0, 2)
+        along, across = field(c, 0, 1), field(c, 1, 0)
+        r = -nu * (tested(lap, 2, 0) + tested(lap, 0, 2)) - tested(lap * along, 1, 0) + tested(lap * across, 0, 1)
+        return cho_solve(mass, r.reshape(-1))
+
+    still = np.zeros((degree, degree))
+    start = -cho_solve(mass, (tested(field(still, 1, 0), 1, 0) + tested(field(still, 0, 1), 0, 1)).reshape(-1))
+    c = solve_ivp(rate, (0.0, end), start, method="BDF", rtol=1e-9, atol=1e-11).y[:, -1].reshape(degree, degree)
+
+    def velocity(points: np.ndarray) -> np.ndarray:
+        (x0, x1, _), (y0, y1, _) = (at(basis, points[:, k]) for k in range(2))
+        g, h = at([clamped], points[:, 0]), at([lift], points[:, 1])
+        along = np.einsum("pi,ij,pj->p", x0, c, y1, optimize=True) + (g[0] * h[1])[:, 0]
+        across = np.einsum("pi,ij,pj->p", x1, c, y0, optimize=True) + (g[1] * h[0])[:, 0]
+        return np.stack([along, -across], axis=1)
+
+    return velocity

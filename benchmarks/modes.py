@@ -1,13 +1,14 @@
 """Eigenvalues against known ones, finite elements beside them: ``python -m benchmarks.modes [names] [--quick]``.
 
-Names: disk, free, plate, ball, elastic, mass, spectra; all without any. Each writes its part of
+Names: disk, free, plate, ball, elastic, mass, spectra, flow; all without any. Each writes its part of
 benchmarks/data/modes.json.
 
 disk, free: -laplacian(u) = lambda u on the unit disk, u or its normal derivative zero: Bessel's zeros. plate: the
 clamped square, against sqrt(lambda) = 35.98519. ball: the unit ball, pi^2. elastic: a square between rollers,
 whose waves are known. mass: div(a grad u) with mass 1 + x y, against order 8 on 2209 particles. spectra: the
 largest real part of the eigenvalues of B^-1 A, of L = laplacian, on clouds of about 400 particles; none may be
-above 1e-6. Elements: scikit-fem's P2 on triangles with curved sides (isoparametric) on the disk.
+above 1e-6. flow: the same of Stokes' equations, with div u = 0 and with an equation for the pressure.
+Elements: scikit-fem's P2 on triangles with curved sides (isoparametric) on the disk.
 """
 
 from __future__ import annotations
@@ -202,9 +203,45 @@ def spectrum(kind: str, name: str, cloud: js.Cloud, bcs: Any, order: int, depth:
     }  # fmt: skip
 
 
+# --------------------------------------------------------------------------------------- flow
+
+
+def flows(quick: bool) -> Iterator[dict[str, Any]]:
+    """Stokes' equations u_t - lap u + grad p = 0 between walls, with div u = 0 and with the pressure's own equation."""
+    def constrained(u: Any, x: Any) -> Any:
+        return jnp.append(-js.laplacian(u[:2])(x) + js.grad(u[2])(x), js.divergence(u[:2])(x))
+
+    def reduced(u: Any, x: Any) -> Any:
+        return jnp.append(-js.laplacian(u[:2])(x) + js.grad(u[2])(x), js.laplacian(u[2])(x))
+
+    walls = [js.dirichlet(0.0, field=k) for k in range(2)]
+    free = [*walls, js.condition(lambda u, x, n: js.divergence(u[:2])(x))]
+    clouds = {"jittered": square("jittered", 13), "random": square("random", 13), "disk": disk(0.15)}
+    for kind, cloud in clouds.items():
+        names = [name for name in cloud.groups if name != "interior"]
+        for what, pde, conditions in (("div u = 0", constrained, walls), ("pressure equation", reduced, free)):
+            for order in (4,) if quick else (4, 6):
+                problem = js.Problem(pde, dict.fromkeys(names, conditions), fields=3)
+                yield flow_spectrum(kind, what, cloud, problem, order)
+
+
+def flow_spectrum(kind: str, what: str, cloud: js.Cloud, problem: js.Problem, order: int) -> dict[str, Any]:
+    """All finite modes, with the mean of the pressure held at zero: v = -lambda A^-1 B M v has those of velocities."""
+    pencil = assemble_pencil(problem, cloud, order=order, mass=(True, True, False))
+    a, b = (m.host.toarray()[np.ix_(pencil.free, pencil.free)] for m in (pencil.A, pencil.B))
+    pressure = pencil.free % 3 == 2
+    whole = np.block([[a, pressure[:, None]], [pressure[None], np.zeros((1, 1))]])
+    moved = np.vstack([-b[:, ~pressure], np.zeros((1, (~pressure).sum()))])
+    values = 1 / np.linalg.eigvals(np.linalg.solve(whole, moved)[:-1][~pressure])
+    return {
+        "case": "flow", "cloud": kind, "conditions": what, "order": order, "unknowns": len(a),
+        "unstable": int((values.real > 1e-6).sum()), "largest": float(values.real.max()),
+    }  # fmt: skip
+
+
 CASES = {
     "disk": on_disk, "free": free_disk, "plate": plate, "ball": ball, "elastic": elastic, "mass": weighted,
-    "spectra": spectra,
+    "spectra": spectra, "flow": flows,
 }  # fmt: skip
 
 
@@ -212,18 +249,31 @@ def table(lines: list[dict[str, Any]]) -> dict[str, Any]:
     """What the documentation shows: all but spectra, of which it says how many are unstable."""
     rows = []
     for out in lines:
-        if out["case"] != "spectrum":
+        if out["case"] not in ("spectrum", "flow"):
             estimate = f"{out['estimate']:.2f}" if "estimate" in out else ""
             rows.append([out["case"], out["order"], out["unknowns"], f"{out['first']:.1e}",
                          f"{out['largest']:.1e} of {out['values']}", estimate])  # fmt: skip
     spectra = [out for out in lines if out["case"] == "spectrum"]
     note = "Relative errors of values (`python -m benchmarks.modes`)."
     if spectra:
-        kinds = " and ".join(dict.fromkeys(out["cloud"].split(",")[0] for out in spectra))
-        note += (f" Of {len(spectra)} spectra of diffusion, on clouds of the kind {kinds}, "
-                 f"{sum(out['unstable'] > 0 for out in spectra)} have a growing mode.")  # fmt: skip
+        kinds = ", ".join(dict.fromkeys(out["cloud"].split(",")[0] for out in spectra))
+        unstable = sum(out["unstable"] > 0 for out in spectra)
+        note += (f" Of {len(spectra)} spectra of diffusion at orders 2 to 8 ({kinds} particles) {unstable or 'none'} "
+                 f"{'has' if unstable < 2 else 'have'} a growing mode.")  # fmt: skip
     columns = ["problem", "order", "unknowns", "first value above zero", "largest", "estimated / true error"]
     return {"columns": columns, "rows": rows, "note": note}
+
+
+def flow_table(lines: list[dict[str, Any]]) -> dict[str, Any]:
+    """The spectra of flow."""
+    rows = [[out["conditions"], out["cloud"], out["order"], out["unknowns"], out["unstable"], f"{out['largest']:.3g}"]
+            for out in lines]  # fmt: skip
+    note = (
+        "Modes of Stokes' equations between walls (`python -m benchmarks.modes flow`): those of the square begin at "
+        "-52.3, those of the disk at -14.7; a divergence that diffuses begins at -49.3, on the disk at -14.7."
+    )
+    return {"columns": ["third equation", "particles", "order", "unknowns", "growing modes", "largest real part"],
+            "rows": rows, "note": note}  # fmt: skip
 
 
 def main(given: Namespace) -> None:
@@ -238,7 +288,10 @@ def main(given: Namespace) -> None:
             lines.append(out)
         if not given.quick:
             data[name] = lines
-            data["tables"] = {"modes": table([out for case in CASES for out in data.get(case, [])])}
+            data["tables"] = {
+                "modes": table([out for case in CASES for out in data.get(case, [])]),
+                "flow-modes": flow_table(data.get("flow", [])),
+            }
             DATA.write_text(json.dumps(data, indent=1) + "\n")
 
 

@@ -104,6 +104,7 @@ def shared_elimination(disc: Discretization, nums: Numbers) -> Elimination | Non
 
 
 @partial(in_one_program, static=("scheme",))
+@partial(jax.jit, static_argnames="scheme")  # its many small operations one by one take longer than a hundred solves
 def _eliminate(scheme: Scheme, jac: Any) -> Elimination:
     made = eliminate(scheme, jac, 1.0)
     return made._replace(particular=as_matrix(made.particular))

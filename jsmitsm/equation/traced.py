@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -15,7 +15,7 @@ from jax.extend.core import Literal
 
 from jsmitsm.equation.branches import Branches
 from jsmitsm.equation.jumps import jumps
-from jsmitsm.equation.linearizing import Record
+from jsmitsm.equation.linearizing import Record, open_fields, slots_of
 from jsmitsm.equation.record_form import Form, is_fixed
 from jsmitsm.runtime.compiled import Same, fingerprint, kept, remembered
 from jsmitsm.runtime.jaxprs import EVERYTHING, NOTHING, inner_jaxprs, levels
@@ -149,6 +149,13 @@ class Traced:
         """The residual alone (E, N) at the points, where the slots' derivatives are ``slots`` (S, N) or zero."""
         inputs = self._inputs(points, 0, (), params, None if slots is None else slots[:, None])
         return self._compute(inputs, 0, False, True)[1][:, 0]
+
+    def written(self, x: Any, derivative: Callable[[Slot], Any], params: Any) -> Any:
+        """The residual (E,) at a point as it was written, with ``derivative`` of every slot in the fields' places."""
+        r = self._record
+        asked = {slot: derivative(slot) for slot in slots_of(r.written)}
+        consts = r.consts[len(r.consts) - len(r.written.constvars) :]
+        return open_fields(r.written, consts, [x, *jax.tree.leaves(params)], asked)[0]
 
     @cached_property
     def kinked_source(self) -> bool:

@@ -83,15 +83,18 @@ def started(run: Run, h: float) -> np.ndarray:
     semi, t0 = run.semi, float(run.t[0])
     flat = [np.asarray(v).reshape(-1) for v in run.start]
     y = np.concatenate([v[semi.free] for v in flat])
-    force, held = _now(run, t0)
+    force, held = _now(run, t0, y)
     asked = semi.masses_held[-1].host @ flat[-1][semi.held]
     jump = semi.system.force(asked) - held
     scale = max(float(np.abs(v).max(initial=0.0)) for v in flat)
     gap = np.abs(flat[0][semi.held] - np.asarray(semi.sample(np.asarray(t0))[0])).max(initial=0.0)
     still = semi.system.undriven()
     small = 1e-7 * h
-    if run.algebraic:  # a vanishing step of backward Euler settles what holds at every moment
-        return semi.system.resolvent(small).solve(semi.system.mass(y) + jump + small * force)
+    if run.algebraic:  # a vanishing step of backward Euler takes the impulse, another settles what holds always
+        resolvent, mass = semi.system.resolvent(small), semi.system.mass
+        y = resolvent.solve(mass(y) + jump + small * force)
+        force, later = _now(run, t0 + small, y)
+        return resolvent.solve(mass(y) + held - later + small * force)
     if not semi.second and gap > 1e-13 * scale and semi.masses_held[-1].values.size:
         if still.any():
             return semi.system.resolvent(small).solve(semi.system.mass(y) + jump + small * force)
@@ -99,16 +102,11 @@ def started(run: Run, h: float) -> np.ndarray:
     return y
 
 
-def _now(run: Run, t: float) -> tuple[np.ndarray, np.ndarray]:
+def _now(run: Run, t: float, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     samples = run.semi.samples(np.array([t]))
     force, held = run.semi.forces(*samples)
-    explicit = 0.0 if run.semi.linear else run.semi.explicit(started_raw(run), t, samples[0][:, 0])
+    explicit = 0.0 if run.semi.linear else run.semi.explicit(y, t, samples[0][:, 0])
     return force[0] + explicit, held[0]
-
-
-def started_raw(run: Run) -> np.ndarray:
-    """The state as it was given."""
-    return np.concatenate([np.asarray(v).reshape(-1)[run.semi.free] for v in run.start])
 
 
 def _equal(run: Run, y: np.ndarray, times: np.ndarray, history: History, shown: Any) -> None:
@@ -125,10 +123,10 @@ def _equal(run: Run, y: np.ndarray, times: np.ndarray, history: History, shown: 
             stepper = run.stepper(run.semi)
             step = stepper.first(step.y, float(times[k]))
         step = _one(run, stepper, step, float(times[k]), h, k in wanted)
+        _refuse_growth(history, step.y[: run.semi.system.n], float(times[k + 1]))
         history.add(float(times[k + 1]), step, k + 1)
         if k in wanted:
             history.in_time.add(stepper, step, float(times[k + 1]), h, wanted[k])
-        _refuse_growth(history, step, float(times[k + 1]))
         run.counts["steps"] += 1
         shown.update()
 
@@ -145,11 +143,11 @@ def _one(run: Run, stepper: Any, step: Step, t: float, h: float, look: bool) -> 
         raise Stopped(f"the stage's system at t = {t:.6g} cannot be solved: {fault}") from fault
 
 
-def _refuse_growth(history: History, step: Step, t: float) -> None:
-    first = max(float(np.abs(history.states[0]).max(initial=0.0)), 1.0)
-    if history.scale > BLOWN * first:
+def _refuse_growth(history: History, values: np.ndarray, t: float) -> None:
+    first, size = max(float(np.abs(history.states[0]).max(initial=0.0)), 1.0), float(np.abs(values).max(initial=0.0))
+    if size > BLOWN * first:
         raise Stopped(
-            f"the solution blew up: it is {history.scale:.1e} at t = {t:.6g}; take more steps, or, where the equation "
+            f"the solution blew up: it is {size:.1e} at t = {t:.6g}; take more steps, or, where the equation "
             "itself grows so fast, an earlier end"
         )
 

@@ -14,13 +14,13 @@ from jsmitsm.discretization.coefficients import slot_series
 from jsmitsm.discretization.layout import discretize
 from jsmitsm.discretization.pencil.assemble import assemble_pencil
 from jsmitsm.equation.field import RATE
-from jsmitsm.evolution.space.convection import refuse_convection
+from jsmitsm.evolution.space.convection import flag_divergence, refuse_convection
 from jsmitsm.evolution.space.semidiscrete import Driver, Semidiscrete, local_fits
 from jsmitsm.evolution.space.timed import Timed
 from jsmitsm.evolution.steps.newton import Newton
 from jsmitsm.evolution.steps.stepping import RadauStepper, Stepper
 from jsmitsm.evolution.steps.tableaux import EULER, KENCARP4, RADAU, Additive, Radau
-from jsmitsm.runtime.errors import is_number
+from jsmitsm.runtime.errors import is_number, some
 from jsmitsm.runtime.tracers import is_traced
 
 # A quasilinear problem is linearised anew where its coefficients have changed by this part of themselves.
@@ -81,7 +81,8 @@ class Run:
             return asked
         if timed.linear:
             return "radau" if self.order >= 6 or self.second or self.algebraic else "esdirk"
-        return "esdirk" if timed.quasilinear or self.algebraic else "imex"
+        # Second derivatives and higher ones that are nonlinear are too stiff to be taken explicitly.
+        return "esdirk" if timed.quasilinear or self.algebraic or max(timed.rest.order) > 1 else "imex"
 
     def _damping(self, asked: Any) -> float:
         """The factor of the damping matrix."""
@@ -130,9 +131,25 @@ class Run:
         semi = Semidiscrete(timed, pencil, self.params, self.damping, reference)
         if not self.traced:
             refuse_convection(semi, self.flags)
+            if timed.flow is not None:
+                flag_divergence(semi, self.start[0], self.flags)
         self.told = list(pencil.health)
+        self._flag_signs(pencil)
+        if timed.flow is not None:
+            self.told.append(f"Field {timed.flow.pressure}, a pressure, has the divergence of the other equations for "
+                             "its own; what the start has of a divergence diffuses.")  # fmt: skip
         self.counts["seconds in pencils"] = self.counts.get("seconds in pencils", 0.0) + time.perf_counter() - began
         return semi
+
+    def _flag_signs(self, pencil: Any) -> None:
+        """A flag where particles without conditions have equations that would grow in time."""
+        fitness, disc = pencil.layout.fitness, pencil.layout.disc
+        wrong = np.zeros(0, int) if fitness is None else fitness.wrong
+        wrong = wrong[disc.n_own[wrong] == 0] if len(wrong) else wrong
+        if len(wrong):
+            flag = (f"The source has the wrong sign in the rows of {len(wrong)} particle(s), first {some(wrong)}: the "
+                    "evolution may be unstable.")  # fmt: skip
+            self.flags += [] if flag in self.flags else [flag]
 
     def finer(self) -> Semidiscrete:
         """The semidiscrete equations of two orders more, as they are at the start."""

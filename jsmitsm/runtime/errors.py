@@ -36,6 +36,8 @@ SYMPTOMS = {
     "where regions meet": "meeting",
     "The estimated error in time": "time",
     "Between neighbouring particles convection": "drift",
+    "has the wrong sign": "sign",
+    "free of divergence": "divergence",
     "are not resolved, or spurious": "modes",
     "shorter than four": "modes",
     "far from self-adjoint": "self-adjoint",

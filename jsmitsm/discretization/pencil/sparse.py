@@ -14,8 +14,8 @@ from jsmitsm.runtime.collector import uncollected
 from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.runtime.whole_program import picked
 
-# Entries that are taken together, few enough to stay in cache.
-CHUNK = 256
+# Numbers that are taken together, few enough to stay in cache.
+CHUNK = 2**17
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=["values", "rows", "cols"], meta_fields=["shape"])
@@ -40,6 +40,15 @@ class Sparse:
     def host_transposed(self) -> Any:
         """Its transpose for scipy, by rows."""
         return self.host.T.tocsr()
+
+    @cached_property
+    def by_width(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Rows (n,) that have w entries each, and which these are (n, w), for every w."""
+        order = np.argsort(self.rows, kind="stable")
+        counts = np.bincount(self.rows, minlength=self.shape[0])
+        first = np.cumsum(counts) - counts
+        alike = [(np.flatnonzero(counts == w), w) for w in np.unique(counts[counts > 0])]
+        return [(some, order[first[some][:, None] + np.arange(w)]) for some, w in alike]
 
     def times(self, x: Any) -> Any:
         """The product with x (n,) or (n, m), by scipy or, where anything is traced, by JAX."""
@@ -107,9 +116,11 @@ _product.defvjp(_product_forward, _product_backward)
 def sampled(matrix: Sparse, left: np.ndarray, right: np.ndarray) -> np.ndarray:
     """The entries of left right^T, (n, m) and (k, m), at the places of a matrix."""
     out = np.empty(len(matrix.rows))
-    for k in range(0, len(out), CHUNK):
-        some = slice(k, k + CHUNK)
-        np.einsum("ej,ej->e", left[matrix.rows[some]], right[matrix.cols[some]], out=out[some])
+    for rows, entries in matrix.by_width:
+        size = max(1, CHUNK // (entries.shape[1] * left.shape[1]))
+        for k in range(0, len(rows), size):
+            some = entries[k : k + size]
+            out[some] = (right[matrix.cols[some]] @ left[rows[k : k + size], :, None])[..., 0]
     return out
 
 

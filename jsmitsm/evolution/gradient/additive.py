@@ -35,42 +35,35 @@ def back(
     at, system, pull, ys = bars.at, bars.system, bars.pull, [y, *stages]
     h, g, s = float(at.h), scheme.gamma, scheme.stages - 1
     first = k * s
-    rates = _rates(scheme, bars, newton is not None, ys, first) if bars.timed else None
-    p_bar, q_bar = (np.zeros((s + 1, system.size)) for _ in range(2))
-    start_bar, stage_bar = np.zeros(system.size), y_bar
+    low, p_bar = np.empty((s, system.size)), np.zeros((s + 1, system.size))
+    stage_bar = y_bar
     for i in range(s, 0, -1):
-        number = first + i
-        slope = p_bar[i]
         if newton is None or pull is None:
-            low = system.resolvent(h * g).solve_transposed(stage_bar)
+            low[i - 1] = system.resolvent(h * g).solve_transposed(stage_bar)
         else:
-            low = newton.transposed(stage_bar, ys[i], at.times[number], h * g, at.known[number], pull, number)
-            pull.collect((g * h) * low + slope, ys[i], number)
-        start_bar += system.mass_transposed(low)
-        bars.jump[first] += low
-        bars.jump[number] -= low
-        bars.force[number] += (g * h) * low
-        for j in range(i):
-            if scheme.implicit[i, j]:
-                p_bar[j] += (h * scheme.implicit[i, j]) * low
-            if pull is not None and newton is None and scheme.explicit[i, j]:
-                q_bar[j] += (h * scheme.explicit[i, j]) * low
-        if rates is not None:
-            bars.h += float(low @ rates[i])
-        bars.mass(low, y - ys[i])
-        bars.stiff((-g * h) * low - slope, ys[i])
+            number = first + i
+            low[i - 1] = newton.transposed(stage_bar, ys[i], at.times[number], h * g, at.known[number], pull, number)
+            pull.collect((g * h) * low[i - 1] + p_bar[i], ys[i], number)
         # On to stage i - 1: what asked for its slope.
-        p_bar[i - 1][bars.still] = 0.0
-        number, slope = number - 1, p_bar[i - 1]
-        bars.force[number] += slope
-        stage_bar = -system.stiff_transposed(slope)
+        p_bar[i - 1] = (h * scheme.implicit[i:, i - 1]) @ low[i - 1 :]
+        p_bar[i - 1, bars.still] = 0.0
+        stage_bar = -system.stiff_transposed(p_bar[i - 1])
         if pull is not None:
-            asked = slope if newton is not None else q_bar[i - 1]
-            stage_bar = stage_bar + pull.state(asked, ys[i - 1], number)
+            asked = p_bar[i - 1] if newton is not None else (h * scheme.explicit[i:, i - 1]) @ low[i - 1 :]
+            stage_bar += pull.state(asked, ys[i - 1], first + i - 1)
             if newton is None or i == 1:
-                pull.collect(asked, ys[i - 1], number)
-    bars.stiff(-p_bar[0], y)
-    return start_bar + stage_bar
+                pull.collect(asked, ys[i - 1], first + i - 1)
+    if bars.timed:
+        rates = _rates(scheme, bars, newton is not None, ys, first)
+        bars.h += sum(float(v @ rate) for v, rate in zip(low, rates[1:]))
+    total, states = low.sum(axis=0), np.array(ys)
+    bars.jump[first] += total
+    bars.jump[first + 1 : first + s + 1] -= low
+    bars.mass(low, y - states[1:])
+    p_bar[1:] += (g * h) * low
+    bars.force[first : first + s + 1] += p_bar
+    bars.stiff(-p_bar, states)
+    return system.mass_transposed(total) + stage_bar
 
 
 def _rates(scheme: Additive, bars: Bars, newton: bool, ys: list[np.ndarray], first: int) -> list[Any]:
@@ -82,7 +75,8 @@ def _rates(scheme: Additive, bars: Bars, newton: bool, ys: list[np.ndarray], fir
         q = [bars.semi.explicit(y, at.times[first + j], at.known[first + j]) for j, y in enumerate(ys)]
         if newton:
             p, q = [a + b for a, b in zip(p, q)], [np.zeros_like(v) for v in q]
-    slopes = [np.where(bars.still, 0.0, v) for v in p]
+    slopes = np.array(p)
+    slopes[:, bars.still] = 0.0
     out: list[Any] = [None]
     for i in range(1, s + 1):
         before = sum(scheme.implicit[i, j] * slopes[j] + scheme.explicit[i, j] * q[j] for j in range(i))

@@ -22,7 +22,7 @@ class Bars:
     def __init__(self, semi: Semidiscrete, at: Inputs, timed: bool):
         self.semi, self.at, self.timed = semi, at, timed
         self.system = system = semi.system
-        self.still = system.undriven()
+        self.still = np.flatnonzero(system.undriven())
         self.force, self.jump = np.zeros(at.force.shape), np.zeros(at.jump.shape)
         self.h = 0.0
         self.pull = None if at.push is None else Pull(semi, at)
@@ -32,14 +32,14 @@ class Bars:
         self._stiff: list[tuple[np.ndarray, np.ndarray]] = []
 
     def mass(self, left: np.ndarray, right: np.ndarray) -> None:
-        """E* += left right^T; the upper half of E, where there is one, is not differentiated."""
-        self._mass.append((left[self._lower], right[self._lower]))
-        if len(self._mass) == MANY:
+        """E* += left^T right, of rows (m, size); the upper half of E, where there is one, is not differentiated."""
+        self._mass.append((left[:, self._lower], right[:, self._lower]))
+        if sum(len(v) for v, _ in self._mass) >= MANY:
             self._flush()
 
     def stiff(self, left: np.ndarray, right: np.ndarray) -> None:
-        """A* += left right^T."""
-        self._stiff.append((left[self._lower], right))
+        """A* += left^T right."""
+        self._stiff.append((left[:, self._lower], right))
 
     def _flush(self) -> None:
         system, n = self.system, self.system.n
@@ -63,7 +63,7 @@ class Bars:
 
 
 def _columns(pairs: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, ...]:
-    return tuple(np.ascontiguousarray(np.stack(v).T) for v in zip(*pairs))
+    return tuple(np.ascontiguousarray(np.concatenate(v).T) for v in zip(*pairs))
 
 
 class Pull:

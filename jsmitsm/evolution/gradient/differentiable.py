@@ -12,7 +12,7 @@ from jsmitsm.evolution.evolution import Evolution
 from jsmitsm.evolution.gradient.adjoint import Plan, states
 from jsmitsm.evolution.gradient.inputs import Inputs, Push
 from jsmitsm.evolution.run import Run, drifted
-from jsmitsm.evolution.space.semidiscrete import Semidiscrete
+from jsmitsm.evolution.space.semidiscrete import Semidiscrete, centred
 from jsmitsm.evolution.steps import dense_output
 from jsmitsm.evolution.steps.tableaux import Additive, Radau
 from jsmitsm.runtime.tracers import is_traced
@@ -41,13 +41,12 @@ def differentiable(run: Run, steps: int, parts: np.ndarray) -> Evolution:
         out = states(plan, given)
         made = len(out) - 1
         found.append(out if not found else out[1:])
-        last = slice(None) if done + made == steps else slice(0, made * m)
-        known.append([v[:, last] for v in samples])
+        known.append([v if done + made == steps else v[:, : made * m] for v in (samples[0], *samples[3:4])])
         done, y, fresh = done + made, out[-1], True
         if done < steps:
             run.renew(y, t0 + h * done)
-    samples = [jnp.concatenate(v, axis=1) for v in zip(*known)]
-    u, rates = _saved(run.semi, parts, steps, m, jnp.concatenate(found), samples)
+    held = [v[0] if len(v) == 1 else jnp.concatenate(v, axis=1) for v in zip(*known)]
+    u, rates = _saved(run.semi, parts, steps, m, jnp.concatenate(found), held)
     recipe = Recipe("S", run.order, None, "loo", run.fields, min(2, HIGHEST - run.order))
     finite = jnp.isfinite(u).all()
     good = finite if is_traced(finite) else bool(finite)
@@ -65,37 +64,43 @@ def _inputs(
     times = t0 + h * places
     samples = semi.samples(times)
     windows = np.arange(steps)[:, None] * m + np.arange(m + 1)
-    # Steps stand before nodes, and both last.
-    cut = [v[:, windows] for v in samples]
-    blended = [v.reshape(v.shape[0], steps * s) for v in semi.blended(sampling, cut)]
-    force, jump = semi.forces(*[jnp.concatenate([v[:, :1], b], axis=1) for v, b in zip(samples, blended)])
-    numbers = np.append(0, (windows[:, sampling.stages]).reshape(-1))
+    numbers = np.append(0, windows[:, sampling.stages].reshape(-1))
+    of_stages = [v if m == s else v[:, numbers] for v in samples]  # as large as the forces: no copy where all are asked
+    mixed = [_mixed(v, windows, sampling.blend) for v in samples[:2]]
+    force, jump = semi.forces(*mixed, *of_stages[2:])
     push = None if semi.linear else Push(semi.source.values, semi.rest, semi.params, semi.reference)
     if y is None:
         y = _started(run, samples, force[0], jump[0], h, semi.system.undriven())
     values = tuple(jnp.asarray(v) for v in semi.system.values)
-    return samples, Inputs(values, push, y, h, force, jump, samples[0].T[numbers], times[numbers])
+    return samples, Inputs(values, push, y, h, force, jump, of_stages[0].T, times if m == s else times[numbers])
 
 
-def _saved(semi: Semidiscrete, parts: np.ndarray, steps: int, m: int, found: Any, samples: list[Any]) -> list[Any]:
-    """Values (S, N, F) at the saved times, and rates of a problem of second order (or None)."""
+@in_one_program
+def _mixed(values: Any, windows: np.ndarray, blend: np.ndarray) -> Any:
+    """Boundary data at the start and at all stages from those (n, samples) at the nodes; see Sampling."""
+    return jnp.concatenate([values[:, :1], (values[:, windows] @ blend.T).reshape(len(values), -1)], axis=1)
+
+
+def _saved(semi: Semidiscrete, parts: np.ndarray, steps: int, m: int, found: Any, held: list[Any]) -> list[Any]:
+    """Values (S, N, F) at the saved times, and rates of a problem of second order (or None); held: (held, samples)."""
     index, weights = dense_output.weights(np.linspace(0.0, 1.0, steps + 1), parts)
     at = np.round(index * m).astype(int)  # samples at the ends of steps
     size, out = semi.system.n, []
-    places = semi.free, semi.held, semi.disc.partner
-    for part, held in ((slice(None, size), 0), (slice(size, None), 3))[: 1 + semi.second]:
-        out.append(_interpolated(found[:, part], samples[held], weights, index, at, *places, fields=semi.fields))
+    places: Any = semi.free, semi.held, semi.disc.partner
+    static: Any = {"fields": semi.fields, "floating": semi.floating}
+    for part, given in zip((slice(None, size), slice(size, None)), held):
+        out.append(_interpolated(found[:, part], given, weights, index, at, *places, **static))
     return out if semi.second else [*out, None]
 
 
-@partial(in_one_program, static=("fields",))
+@partial(in_one_program, static=("fields", "floating"))
 def _interpolated(found: Any, held_values: Any, weights: Any, index: Any, at: Any, free: Any, held: Any, partner: Any,
-                  fields: int) -> Any:  # fmt: skip
+                  fields: int, floating: int | None) -> Any:  # fmt: skip
     """All values from the free ones (K + 1, n) and the held ones (held, samples) of the steps around saved times."""
     mine = jnp.einsum("sk,skn->sn", weights, jnp.asarray(found)[index])
     given = jnp.einsum("sk,skn->sn", weights, jnp.asarray(held_values).T[at])
     flat = jnp.zeros((len(index), len(partner) * fields)).at[:, free].set(mine).at[:, held].set(given)
-    return flat.reshape(len(index), -1, fields)[:, partner]
+    return centred(flat.reshape(len(index), -1, fields)[:, partner], floating)
 
 
 def _started(run: Run, samples: list[Any], force: Any, jump: Any, h: Any, still: np.ndarray) -> Any:
@@ -111,7 +116,15 @@ def _started(run: Run, samples: list[Any], force: Any, jump: Any, h: Any, still:
         if gap <= 1e-13 * np.abs(np.asarray(flat[0])).max(initial=0.0):
             return y
     moved = semi.masses_held[-1].times(flat[-1][semi.held]) - jump
-    if run.algebraic or still.any():
-        small = 1e-7 * h
+    small = 1e-7 * h
+    if run.algebraic:
+        resolvent, t = semi.system.resolvent(small), run.t[0] + small
+        later = semi.samples(jnp.reshape(t, 1))
+        forces, jumps = semi.forces(*later)
+        for jumped, f, at, known in ((moved, force, run.t[0], samples[0]), (jump - jumps[0], forces[0], t, later[0])):
+            f = f if semi.linear else f + semi.explicit(y, at, known[:, 0])
+            y = resolvent.solve(semi.system.mass(y) + jumped + small * f)
+        return y
+    if still.any():
         return semi.system.resolvent(small).solve(semi.system.mass(y) + moved + small * force)
     return y + semi.system.resolvent(jnp.asarray(0.0)).solve(moved)

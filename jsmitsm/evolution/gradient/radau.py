@@ -34,11 +34,11 @@ def back(
     jumps = np.tensordot(np.linalg.inv(scheme.matrix).T / h, low, axes=1)
     total = jumps.sum(axis=0)
     bars.jump[first] += total
-    for i in range(s):
-        bars.force[first + 1 + i] += low[i]
-        bars.jump[first + 1 + i] -= jumps[i]
-        bars.mass(-jumps[i], stages[i] - y)
-        bars.stiff(-low[i], stages[i])
-        if bars.timed:
-            bars.h += float(low[i] @ (at.force[first + 1 + i] - system.stiff(stages[i]))) / h
+    states = np.array(stages)
+    bars.force[first + 1 : first + s + 1] += low
+    bars.jump[first + 1 : first + s + 1] -= jumps
+    bars.mass(-jumps, states - y)
+    bars.stiff(-low, states)
+    if bars.timed:
+        bars.h += sum(float(low[i] @ (at.force[first + 1 + i] - system.stiff(stages[i]))) for i in range(s)) / h
     return system.mass_transposed(total)

@@ -33,6 +33,7 @@ class RegionsTimed:
     steady: bool
     quasilinear: bool = False
     linear: bool = True
+    flow: None = None
 
     @property
     def masses(self) -> tuple[Any, ...]:

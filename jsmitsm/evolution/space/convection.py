@@ -1,4 +1,4 @@
-"""Convection against diffusion between two particles: what the pencil stands, and what is refused."""
+"""What is said of a flow before its first step: convection that no pencil stands, a start that is no flow."""
 
 from __future__ import annotations
 
@@ -6,10 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from jsmitsm.evolution.space.semidiscrete import Semidiscrete
+from jsmitsm.equation.field import unit
+from jsmitsm.evolution.space.semidiscrete import Semidiscrete, local_fits
 
 # Cell Peclet numbers |v| h / eps: up to the first the recursion is stable, beyond the second nothing is.
 MODERATE, MOST = 2.0, 5.0
+# A divergence at the start that no fit makes, in units of the largest slope.
+DIVERGENT = 0.1
 
 
 def refuse_convection(semi: Semidiscrete, flags: list[str]) -> None:
@@ -53,6 +56,21 @@ def refuse_convection(semi: Semidiscrete, flags: list[str]) -> None:
         flags.append(
             f"Between neighbouring particles convection is {worst:.3g} times the diffusion; up to {MODERATE:g} is "
             "known to be stable: a finer cloud is safer."
+        )
+
+
+def flag_divergence(semi: Semidiscrete, start: Any, flags: list[str]) -> None:
+    """A flag where the velocities at the start (N, F) of an incompressible flow are none."""
+    flow, dim = semi.timed.flow, semi.disc.rec.dim
+    assert flow is not None
+    fits = local_fits(semi.disc, semi.disc.rec.order)
+    along = [fits.derivative(unit(dim, i)).host for i in range(dim)]
+    slopes = np.array([[d @ start[:, k] for d in along] for k in flow.velocity])
+    size, left = float(np.abs(slopes).max()), float(np.abs(np.trace(slopes)).max())
+    if left > DIVERGENT * size:
+        flags.append(
+            f"The start is not free of divergence: div u is up to {left / size:.0%} of the largest slope; it diffuses "
+            "as the velocities do, and the pressure answers to it."
         )
 
 

@@ -209,7 +209,13 @@ class Semidiscrete:
         else:
             flat = np.zeros(self.n * self.fields)
             flat[self.free], flat[self.held] = part, held
-        return flat.reshape(self.n, self.fields)[self.disc.partner]
+        return centred(flat.reshape(self.n, self.fields)[self.disc.partner], self.floating)
+
+    @property
+    def floating(self) -> int | None:
+        """A field that is determined up to a constant: its mean over the particles is zero."""
+        flow = self.timed.flow
+        return flow.pressure if flow is not None and flow.floating else None
 
     def state_fit(self, degree: int) -> StateFit:
         """What gives a state its local polynomials."""
@@ -276,6 +282,14 @@ class Semidiscrete:
         t = t if is_traced(t) else np.asarray(float(t))
         u = self.placed(y[: self.system.n], known)
         return self.system.force(-self.source.times(self.nonlinear(self.slot_values(u), t, self.params)))
+
+
+def centred(values: Any, field: int | None) -> Any:
+    """Values (..., N, F) with mean zero of one field, if any."""
+    if field is None:
+        return values
+    only = np.arange(values.shape[-1]) == field
+    return values - values.mean(axis=-2, keepdims=True) * only
 
 
 class Driver:

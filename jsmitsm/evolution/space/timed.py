@@ -24,6 +24,7 @@ from jsmitsm.equation.field import RATE
 from jsmitsm.equation.problem import Problem, of_parts
 from jsmitsm.equation.traced import Traced
 from jsmitsm.equation.tracing import moving, restricted, trace
+from jsmitsm.evolution.space.incompressible import Flow, flow_of, with_pressure_equation
 from jsmitsm.runtime.collector import uncollected
 from jsmitsm.runtime.errors import IN_FUNCTIONS, in_words
 from jsmitsm.runtime.tracers import is_traced
@@ -40,6 +41,7 @@ class Timed:
     problem : closed, its pde the record of L. rest: N. masses: coefficients of the first and the second rate.
     steady : whether neither N at u = 0 nor a condition depends on t.
     quasilinear : whether N holds derivatives of the order of an equation. space: the whole residual without rates.
+    flow: of an incompressible flow, whose constraint has become an equation for the pressure.
     """
 
     problem: Problem
@@ -48,6 +50,7 @@ class Timed:
     masses: tuple[Traced, ...]
     steady: bool
     quasilinear: bool
+    flow: Flow | None = None
 
     @property
     def operator(self) -> Traced:
@@ -90,16 +93,11 @@ def timed(problem: Problem, cloud: Cloud) -> Timed:
         for name, conditions in problem.bcs.items()
     }
     stated = Problem(pde, bcs, problem.fields, (np.asarray(0.0), problem.params))
-    try:
-        whole = trace(pde, cloud.dim, problem.fields, params=stated.params)
-    except IN_FUNCTIONS as error:
-        text = in_words(error)
-        raise ValueError(text if text.startswith("pde") else f"pde: {text}; it returns a number or a scalar per "
-                         "equation") from error  # fmt: skip
-    if whole.n_equations != problem.fields:
-        raise ValueError(
-            f"pde: returns {whole.n_equations} residual(s) for fields={problem.fields}; a system of F fields needs F"
-        )
+    whole = _recorded(stated, cloud.dim)
+    flow = flow_of(stated, whole, cloud)
+    if flow is not None:
+        stated, flow = with_pressure_equation(stated, whole, flow, cloud)
+        whole = _recorded(stated, cloud.dim)
     changing, source_moves = moving(whole, TIME)
     rates = [[s for s in whole.slots if s[0] // RATE == j] for j in (1, 2)]
     _check_rates(rates, changing)
@@ -117,7 +115,23 @@ def timed(problem: Problem, cloud: Cloud) -> Timed:
         problem_in_time, still, rest, tuple(masses),
         not source_moves and not condition_moves,
         any(m > max(o, 0) for m, o in zip(orders, operator.order)),
+        flow,
     )  # fmt: skip
+
+
+def _recorded(stated: Problem, dim: int) -> Traced:
+    """The record of the whole residual."""
+    try:
+        whole = trace(stated.pde, dim, stated.fields, params=stated.params)  # type: ignore[arg-type]
+    except IN_FUNCTIONS as error:
+        text = in_words(error)
+        raise ValueError(text if text.startswith("pde") else f"pde: {text}; it returns a number or a scalar per "
+                         "equation") from error  # fmt: skip
+    if whole.n_equations != stated.fields:
+        raise ValueError(
+            f"pde: returns {whole.n_equations} residual(s) for fields={stated.fields}; a system of F fields needs F"
+        )
+    return whole
 
 
 def _check_rates(rates: list[list[Slot]], changing: set[Slot]) -> None:
@@ -147,9 +161,9 @@ def _check_constraints(whole: Traced, fields: int) -> None:
     if (found < 0).any():
         names = ", ".join(str(k) for k in still[found < 0])
         raise ValueError(
-            f"pde: field {names} has no rate, and no equation without a rate determines it, as with the pressure "
-            "beside div u = 0 (a constraint of index 2), which js.evolve does not do; solve for a stream function, or "
-            "for the steady flow by js.solve"
+            f"pde: field {names} has no rate, and no equation without a rate determines it: a constraint of index 2, "
+            "of which js.evolve knows div u = 0 of incompressible flow alone; differentiate the constraint until it "
+            "holds the field"
         )
 
 
