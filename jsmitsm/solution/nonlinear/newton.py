@@ -33,7 +33,7 @@ SHORTEST, REFUSED = 1.0 / 16.0, 12
 ROUNDING, ROUND_OFF, STALLED = 10 * np.finfo(float).eps, 1e-6, 1e-7
 # Steps of less than CLOSE of the solution that fall to no less than SLOW of the one before converge linearly, and are
 # mixed with up to DEPTH that came before.
-SLOW, CLOSE, DEPTH = 0.25, 1e-3, 4
+SLOW, CLOSE, DEPTH = 0.25, 2e-2, 4
 # Where only the first full step tells how large the solution is, it may be this much larger than that.
 WARY = 0.01
 NOTHING = "the equation says nothing"
