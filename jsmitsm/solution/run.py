@@ -27,7 +27,7 @@ from jsmitsm.runtime.tracers import concrete, is_traced
 from jsmitsm.solution.balance import imbalance, spread, unbalanced, with_multiplier
 from jsmitsm.solution.flags import flags, scales
 from jsmitsm.solution.memory import refuse_too_large
-from jsmitsm.solution.statistics import skipped
+from jsmitsm.solution.statistics import of_run
 
 # Under a JAX transform a system is taken for singular whose solution outgrows its right-hand side by so many times the
 # usual condition, and data for unbalanced that leave this part of them: there no other order is compared.
@@ -301,6 +301,12 @@ class Run:
             points = None if points is None else np.concatenate([points, np.full((1, points.shape[1]), np.nan)])
         return data, r, c, b, points
 
+    def become(self, other: Run) -> None:
+        """Go on as another run of the same problem; what was asked for, and when, stays."""
+        mine = {name: getattr(self, name) for name in ("throw", "began")}
+        seconds = {name: spent + other.seconds.get(name, 0.0) for name, spent in self.seconds.items()}
+        self.__dict__ = {**vars(other), **mine, "seconds": seconds}
+
     def check_balance(self, taylor: Any = None) -> None:
         """A field without values: its data must balance, up to what the discretisation explains.
 
@@ -317,8 +323,13 @@ class Run:
             self.object(told)
 
     def _rest(self) -> float:
-        """What the data leave where they do not balance, see ``jsmitsm.solution.balance``."""
-        return spread(self.misfit, self.disc.rec.dim) if self.formulation == "lsq" else self.imbalance
+        """What the data leave where they do not balance, see ``jsmitsm.solution.balance``.
+
+        Of nonlinear ones in the least-squares form only the error estimate tells, which is asked there anyway.
+        """
+        if self.formulation != "lsq":
+            return self.imbalance
+        return spread(self.misfit, self.disc.rec.dim) if self.disc.linear else 0.0
 
     def _imbalance_at(self, taylor: Any, order: int) -> float:
         """The same of the same problem with method S of another order."""
@@ -374,24 +385,4 @@ class Run:
 
     def stats(self) -> dict[str, Any]:
         """What a user may want to know about the solve."""
-        disc = self.disc
-        out: dict[str, Any] = {
-            "seconds": dict(self.seconds),
-            "depth": disc.rec.depth,
-            "particles": len(disc.cloud),
-            "unknowns": int((~disc.held).sum()),
-            "neighbours": max((c.neighbours.shape[1] for c in disc.classes), default=0),
-            "linear": self.linear,
-            "formulation": self.formulation,
-            "skipped": skipped(disc, self.linear, self.values is None),
-            "messages": list(self.messages),
-        }
-        if self.changes:
-            out["changes"] = list(self.changes)
-        if "residual" in self.linear:
-            out["residual"] = self.linear["residual"]
-        if self.health is not None:
-            out["lebesgue_max"] = self.health.largest
-            out["repaired"] = self.health.repaired
-            out["weak"] = self.health.weak
-        return out
+        return of_run(self)
