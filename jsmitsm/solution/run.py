@@ -364,7 +364,7 @@ class Run:
     @cached_property
     def misfit(self) -> np.ndarray | None:
         """By how much each particle's value misses its local fit, in parts of the range; of the least-squares form."""
-        if self.formulation != "lsq" or self.nums is None:
+        if self.formulation != "lsq" or self.nums is None or self.values is None:
             return None
         leading = np.array(self.disc.rec.weights) == 0
         return misfit(self.disc, self.nums, self.values) / scales(self.values[:, leading]).max()
