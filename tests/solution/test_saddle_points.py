@@ -3,9 +3,9 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
 import jsmitsm as js
+from jsmitsm.solution.nonlinear import newton
 
 SIDES = ("left", "right", "bottom", "top")
 # Botella and Peyret (1998), Re = 100: least u on x = 1/2, largest and least v on y = 1/2.
@@ -40,11 +40,11 @@ def test_the_fits_of_a_pressure_agree_in_the_mean():
     assert (errors["auto"][:2] < errors["loo"][:2] / 4).all() and errors["auto"][2] < errors["loo"][2]
 
 
-def cavity(pinned):
+def cavity():
     wall = [js.dirichlet(0.0, field=0), js.dirichlet(0.0, field=1)]
     bcs = dict.fromkeys(SIDES, wall) | {"top": [js.dirichlet(1.0, field=0), wall[1]]}
-    fixed = {"pin": js.fix([0], 0.0, field=2)} if pinned else {}
-    return js.Problem(lambda u, x: flow(u, x, 0.01, 1.0), bcs | fixed, fields=3)
+    bcs["pin"] = js.fix([0], 0.0, field=2)
+    return js.Problem(lambda u, x: flow(u, x, 0.01, 1.0), bcs, fields=3)
 
 
 def extremes(sol):
@@ -54,19 +54,23 @@ def extremes(sol):
     return float(u.min()), float(v.max()), float(v.min())
 
 
-@pytest.mark.parametrize("pinned", [False, True], ids=["floating", "pinned"])
-def test_a_lid_drives_the_flow_from_zero(pinned):
+def test_a_lid_drives_the_flow_from_zero():
     """Its speed jumps in the corners, where a fit's expansions do not settle, and are frozen."""
-    sol = js.solve(cavity(pinned), js.rectangle((0, 0), (1, 1), (21, 21)), depth=0)
+    sol = js.solve(cavity(), js.rectangle((0, 0), (1, 1), (21, 21)), depth=0)
     assert sol.converged and sol.stats["changes"][-1] < 1e-9
-    print(extremes(sol), sol.iterations)
-    np.testing.assert_allclose(extremes(sol), EXTREMES, rtol=0.1)
+    np.testing.assert_allclose(extremes(sol), EXTREMES, rtol=0.1)  # rows of one spacing; 1,625 graded leave 0.5 %
 
 
-def test_where_deep_expansions_do_not_settle_there_is_the_solution_without():
-    sol = js.solve(cavity(False), js.rectangle((0, 0), (1, 1), (13, 13)))
-    assert sol.converged and sol.depth == 0
+def test_where_deep_expansions_do_not_settle_there_is_the_solution_without(monkeypatch):
+    damped = newton._damped
+
+    def never_deep(record, here, target):
+        return damped(record, here, target)._replace(good=not record.run.disc.rec.depth)
+
+    monkeypatch.setattr(newton, "_damped", never_deep)
+    ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(0.0)}
+    problem = js.Problem(lambda u, x: js.laplacian(u)(x) + jnp.exp(u(x)), ends)
+    sol, flat = (js.solve(problem, js.interval(0.0, 1.0, 21), depth=depth) for depth in ("auto", 0))
+    assert sol.converged and sol.depth == 0 and sol.coefficients.shape == (21, 5)
     assert any("this is without depth" in m for m in sol.stats["messages"])
-    print(extremes(sol), sol.iterations)
-    np.testing.assert_allclose(extremes(sol), EXTREMES, rtol=0.2)
-    assert sol.coefficients.shape == (169, 15, 3)
+    np.testing.assert_allclose(sol.u, flat.u, atol=1e-9)
