@@ -135,9 +135,9 @@ def table(parts: dict[str, list[dict[str, Any]]]) -> dict[str, Any]:
         for part in parts.values() for r in part
     ]  # fmt: skip
     note = (
-        "`python -m benchmarks.cavity`, order 4, depth 0: extremes of the velocities on the centre lines, and by how much "
-        "they differ from those of a Chebyshev collocation (smooth lid), of Ghia, Ghia and Shin (1982), and of Botella and "
-        "Peyret (1998)."
+        "`python -m benchmarks.cavity`, order 4, depth 0: extremes of the velocities on the centre lines, and by how "
+        "much they differ from those of a Chebyshev collocation (smooth lid), of Ghia, Ghia and Shin (1982), and of "
+        "Botella and Peyret (1998)."
     )
     return {
         "columns": ["case", "particles", "steps", "least u", "largest v", "least v", "estimated error"],
