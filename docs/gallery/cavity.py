@@ -19,7 +19,7 @@ def flow(u, x):  # u[:2] is the velocity, u[2] the pressure
     return jnp.append(force, js.divergence(u[:2])(x))
 
 
-square = js.rectangle((0, 0), (1, 1), (17, 17))
+square = js.rectangle((0, 0), (1, 1), (21, 21))
 still = [js.dirichlet(0.0, field=k) for k in (0, 1)]
 bcs = dict.fromkeys(("left", "right", "bottom"), still)
 bcs["top"] = [js.dirichlet(1.0, field=0), js.dirichlet(0.0, field=1)]

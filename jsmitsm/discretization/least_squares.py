@@ -49,9 +49,12 @@ def least_squares_right_side(disc: Discretization, nums: Numbers, parts: list[tu
 
 
 def misfit(disc: Discretization, nums: Numbers, values: Any) -> np.ndarray:
-    """By how much each particle's value (N, F) misses its local fit, in the least-squares form."""
+    """By how much each particle's value (N, F) misses its local fit, in the least-squares form.
+
+    A field that counts fewer derivatives than the others has another unit, and is left out.
+    """
     shared, there = shared_elimination(disc, nums), around(disc, nums)
-    own, found = slice(0, disc.rec.fields), np.zeros(len(disc.cloud))
+    own, found = np.flatnonzero(np.array(disc.rec.weights) == 0), np.zeros(len(disc.cloud))
     for cls in _fitted(disc, nums):
         block = _class_blocks(disc, nums, cls, shared, there)
         near = np.maximum(disc.images.owners(cls.neighbours), 0)

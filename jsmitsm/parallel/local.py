@@ -15,7 +15,7 @@ import numpy as np
 from jsmitsm.cloud.neighbours import EVEN_SAMPLE, Stencils, is_even, kept_distances, nearest
 from jsmitsm.discretization.coefficients import Numbers, numbers
 from jsmitsm.discretization.layout import Class, discretize, sorted_classes, table
-from jsmitsm.discretization.operator_kind import prefers_least_squares
+from jsmitsm.discretization.operator_kind import information_travels
 from jsmitsm.discretization.resolution.digits import LOOKED_AT
 from jsmitsm.discretization.rows import all_coefficients
 from jsmitsm.discretization.supports import Part
@@ -167,7 +167,7 @@ class Local:
 
     def _refuse_least_squares(self, nums: Numbers) -> None:
         """Where information travels the least-squares form is right, of which the processes make none."""
-        if any(self.team.gather(prefers_least_squares(self.disc, nums))):
+        if any(self.team.gather(information_travels(self.disc, nums))):
             raise ValueError(
                 'formulation: in this equation information travels (first order, or convection above diffusion), and '
                 'the least-squares form is not made for several processes; say formulation="loo" where diffusion '

@@ -45,7 +45,8 @@ def solve(
     order, depth, kernel : optional
         As in ``js.solve``.
     formulation : {"auto", "loo"}
-        "auto" refuses equations in which information travels, where ``js.solve`` takes least squares.
+        "auto" refuses equations in which information travels, where ``js.solve`` takes least squares; in systems with
+        a pressure it is "loo".
     solver : {"auto", "hypre", "gamg", "mumps"}
         "auto": for one field with an operator of second order algebraic multigrid, hypre's and then PETSc's, and what
         these do not solve directly; for all else directly.

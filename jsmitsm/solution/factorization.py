@@ -115,7 +115,8 @@ class Factorization(KeptMatrix):
         values = with_held(disc, nums, x)
         traced = is_traced(values)
         if not traced:
-            run.nums, run.values = nums, np.asarray(values)
+            run.keep(nums, np.asarray(values))
+            good = good and not run.failed
         rec = disc.rec
         recipe = Recipe(
             disc.scheme.method, rec.order, disc.basis_terms, run.formulation, problem.fields, rec.depth,

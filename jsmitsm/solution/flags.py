@@ -297,7 +297,7 @@ def _misfit(run: Any, values: np.ndarray, nums: Any, out: list[str], found: dict
     if run.misfit is None:
         return
     cells = len(values) ** (1.0 / run.disc.rec.dim)
-    found["misfit"] = float(np.sqrt(np.mean((run.misfit / scales(values).max()) ** 2)) * cells)  # no square overflows
+    found["misfit"] = float(np.sqrt(np.mean(run.misfit**2)) * cells)
     if found["misfit"] > MISFIT:
         out.append(
             f"No function fits the equation and the conditions on this cloud: the misfit adds up to "

@@ -24,10 +24,10 @@ from jsmitsm.linear import linsolve
 from jsmitsm.particle.moments import Row
 from jsmitsm.runtime.errors import SolveError, some
 from jsmitsm.runtime.tracers import concrete, is_traced
-from jsmitsm.solution.balance import imbalance, unbalanced
-from jsmitsm.solution.flags import flags
+from jsmitsm.solution.balance import imbalance, spread, unbalanced, with_multiplier
+from jsmitsm.solution.flags import flags, scales
 from jsmitsm.solution.memory import refuse_too_large
-from jsmitsm.solution.statistics import skipped
+from jsmitsm.solution.statistics import of_run
 
 # Under a JAX transform a system is taken for singular whose solution outgrows its right-hand side by so many times the
 # usual condition, and data for unbalanced that leave this part of them: there no other order is compared.
@@ -161,7 +161,7 @@ class Run:
             known = concrete(values)
             finite = jnp.isfinite(values) if known is None else np.isfinite(np.asarray(known))
             return values, finite.all() & good
-        self.nums, self.values = nums, values
+        self.keep(nums, values)
         self._check_degenerate(nums, values)
         return values, bool(good and np.isfinite(values).all() and not self.failed)
 
@@ -246,12 +246,18 @@ class Run:
         values, self.extra = (x[:n], x[n:]) if len(b) > n else (x, np.zeros(0))
         if is_traced(x):
             return values, self._solvable(data, r, c, b, x, points) if balanced else True
-        if self.floating:
+        if self.floating and self.formulation != "lsq":
             system = linsolve.factor(data, r, c, len(b), points, self.solver, self._elliptic)
             self.imbalance = imbalance(lambda e: system.solve(e, transpose=True), x, b, n)
             if balanced:
                 self.check_balance()
         return values, True
+
+    def keep(self, nums: Numbers, values: np.ndarray) -> None:
+        """Keep what a solve leaves for the flags, and judge data whose misfit tells whether they balance."""
+        self.nums, self.values = nums, values
+        if self.formulation == "lsq" and self.floating and self.disc.linear:
+            self.check_balance()
 
     def _solvable(self, data: Any, r: Any, c: Any, b: Any, x: Any, points: Any) -> Any:
         """Under a JAX transform, where nothing raises: whether the system is regular, and floating data balance."""
@@ -286,18 +292,20 @@ class Run:
         return self.disc.rec.fields == 1 and not self.bordering
 
     def _bordered(self, data: Any, r: Any, c: Any, b: Any) -> tuple[Any, Any, Any, Any, Any]:
-        """The system and the places of its unknowns; a row and a column of ones more for every floating field."""
-        disc, fields = self.disc, self.disc.rec.fields
+        """The system and the places of its unknowns; a row and a column more for every floating field."""
+        disc = self.disc
         free = np.flatnonzero(~disc.held.reshape(-1))
-        points = None if is_traced(disc.cloud.points) else np.asarray(disc.cloud.points)[free // fields]
-        xp = jnp if is_traced(data, b) else np
-        for k, f in enumerate(disc.floating):
-            ids = np.flatnonzero(free % fields == f)
-            line = np.full(len(ids), len(free) + k)
-            data, b = xp.concatenate([data, np.ones(2 * len(ids))]), xp.concatenate([b, np.zeros(1)])
-            r, c = np.concatenate([r, ids, line]), np.concatenate([c, line, ids])
+        points = None if is_traced(disc.cloud.points) else np.asarray(disc.cloud.points)[free // disc.rec.fields]
+        for f in disc.floating:
+            data, r, c, b = with_multiplier(data, r, c, b, np.flatnonzero(free % disc.rec.fields == f))
             points = None if points is None else np.concatenate([points, np.full((1, points.shape[1]), np.nan)])
         return data, r, c, b, points
+
+    def become(self, other: Run) -> None:
+        """Go on as another run of the same problem; what was asked for, and when, stays."""
+        mine = {name: getattr(self, name) for name in ("throw", "began")}
+        seconds = {name: spent + other.seconds.get(name, 0.0) for name, spent in self.seconds.items()}
+        self.__dict__ = {**vars(other), **mine, "seconds": seconds}
 
     def check_balance(self, taylor: Any = None) -> None:
         """A field without values: its data must balance, up to what the discretisation explains.
@@ -306,7 +314,7 @@ class Run:
         """
         self.messages.append("The conditions fix the solution only up to a constant; its mean over the particles is 0.")
         told, certain = unbalanced(
-            self.imbalance, partial(self._imbalance_at, taylor), self.disc.rec.order, self.disc.rec.fields,
+            self._rest(), partial(self._imbalance_at, taylor), self.disc.rec.order, self.disc.rec.fields,
             self.disc.linear, self.disc.floating,
         )  # fmt: skip
         if certain:
@@ -314,18 +322,27 @@ class Run:
         elif told:
             self.object(told)
 
+    def _rest(self) -> float:
+        """What the data leave where they do not balance, see ``jsmitsm.solution.balance``.
+
+        Of nonlinear ones in the least-squares form only the error estimate tells, which is asked there anyway.
+        """
+        if self.formulation != "lsq":
+            return self.imbalance
+        return spread(self.misfit, self.disc.rec.dim) if self.disc.linear else 0.0
+
     def _imbalance_at(self, taylor: Any, order: int) -> float:
-        """The mean residual, relative to the data, of the same problem with method S of another order."""
-        cloud = self.disc.cloud
-        disc = discretize(self.problem, cloud, "S", order, None, None, None, depth=self.disc.rec.depth)
-        other = Run(disc, self.problem, self.solver, False, True, "loo")
+        """The same of the same problem with method S of another order."""
+        disc = discretize(self.problem, self.disc.cloud, "S", order, None, None, None, depth=self.disc.rec.depth)
+        form = "lsq" if self.formulation == "lsq" else "loo"
+        other = Run(disc, self.problem, self.solver, False, form == "loo", form)
         if taylor is not None:
             more = max(0, disc.rec.size - taylor.shape[2])
             taylor = np.pad(taylor, ((0, 0), (0, 0), (0, more)))[:, :, : disc.rec.size]
         nums = numbers(disc, self.problem, taylor)
-        classes, rows = other.local_rows(nums)
-        other.solved(*matrix(disc, classes, rows), right_side(disc, nums, classes, rows), balanced=False)
-        return other.imbalance
+        x, _ = other.solved(*other.assembled(nums), balanced=False)
+        other.nums, other.values = nums, with_held(disc, nums, x)
+        return other._rest()
 
     @cached_property
     def factor(self) -> linsolve.Factor | None:
@@ -346,10 +363,11 @@ class Run:
 
     @cached_property
     def misfit(self) -> np.ndarray | None:
-        """By how much each particle's value misses its local fit, in the least-squares form."""
-        if self.formulation != "lsq" or self.nums is None:
+        """By how much each particle's value misses its local fit, in parts of the range; of the least-squares form."""
+        if self.formulation != "lsq" or self.nums is None or self.values is None:
             return None
-        return misfit(self.disc, self.nums, self.values)
+        leading = np.array(self.disc.rec.weights) == 0
+        return misfit(self.disc, self.nums, self.values) / scales(self.values[:, leading]).max()
 
     def condition_numbers(self) -> tuple[np.ndarray, float]:
         """Of the particles' moment matrices (N,), and of the global system."""
@@ -367,24 +385,4 @@ class Run:
 
     def stats(self) -> dict[str, Any]:
         """What a user may want to know about the solve."""
-        disc = self.disc
-        out: dict[str, Any] = {
-            "seconds": dict(self.seconds),
-            "depth": disc.rec.depth,
-            "particles": len(disc.cloud),
-            "unknowns": int((~disc.held).sum()),
-            "neighbours": max((c.neighbours.shape[1] for c in disc.classes), default=0),
-            "linear": self.linear,
-            "formulation": self.formulation,
-            "skipped": skipped(disc, self.linear, self.values is None),
-            "messages": list(self.messages),
-        }
-        if self.changes:
-            out["changes"] = list(self.changes)
-        if "residual" in self.linear:
-            out["residual"] = self.linear["residual"]
-        if self.health is not None:
-            out["lebesgue_max"] = self.health.largest
-            out["repaired"] = self.health.repaired
-            out["weak"] = self.health.weak
-        return out
+        return of_run(self)

@@ -32,3 +32,26 @@ def skipped(disc: Discretization, linear: dict[str, Any], traced: bool) -> list[
     if not traced:
         out.append("bookkeeping for gradients")
     return [*out, "Taylor coefficients until asked for", "error estimate until asked for"]
+
+
+def of_run(run: Any) -> dict[str, Any]:
+    """Everything that a finished run tells of itself."""
+    disc = run.disc
+    out: dict[str, Any] = {
+        "seconds": dict(run.seconds),
+        "depth": disc.rec.depth,
+        "particles": len(disc.cloud),
+        "unknowns": int((~disc.held).sum()),
+        "neighbours": max((c.neighbours.shape[1] for c in disc.classes), default=0),
+        "linear": run.linear,
+        "formulation": run.formulation,
+        "skipped": skipped(disc, run.linear, run.values is None),
+        "messages": list(run.messages),
+    }
+    if run.changes:
+        out["changes"] = list(run.changes)
+    if "residual" in run.linear:
+        out["residual"] = run.linear["residual"]
+    if run.health is not None:
+        out.update(lebesgue_max=run.health.largest, repaired=run.health.repaired, weak=run.health.weak)
+    return out

@@ -194,8 +194,8 @@ class Objective:
         else:
             values, taylor, good, iterations = newton(run, self.values)
         recipe = Recipe(o["method"], o["order"], o.get("basis_terms"), run.formulation, self.problem.fields,
-            self.disc.rec.depth)
-        fit = Fit(disc.problem, self.cloud, kernel, table(disc), taylor, recipe)
+            run.disc.rec.depth)
+        fit = Fit(disc.problem, self.cloud, kernel, table(run.disc), taylor, recipe)
         found = Solution(values, self.cloud, recipe, fit, good, iterations, {})
         return found, *run.seen
 

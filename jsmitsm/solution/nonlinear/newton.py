@@ -33,7 +33,7 @@ SHORTEST, REFUSED = 1.0 / 16.0, 12
 ROUNDING, ROUND_OFF, STALLED = 10 * np.finfo(float).eps, 1e-6, 1e-7
 # Steps of less than CLOSE of the solution that fall to no less than SLOW of the one before converge linearly, and are
 # mixed with up to DEPTH that came before.
-SLOW, CLOSE, DEPTH = 0.25, 1e-3, 4
+SLOW, CLOSE, DEPTH = 0.25, 2e-2, 4
 # Where only the first full step tells how large the solution is, it may be this much larger than that.
 WARY = 0.01
 NOTHING = "the equation says nothing"
@@ -131,10 +131,12 @@ def _searched(record: Record, begin: Iterate, first: Iterate) -> Found:
         return Found(first, np.inf, False, np.zeros(0, int))
     best = _damped(record, begin, first)
     ways = ["damped steps"]
-    further = [("pseudo-time steps", _in_pseudo_time), ("full steps", _wandering)]
-    if record.run.disc.rec.depth:
-        further.insert(0, ("steps without depth", _without_depth))
-    for name, search in further:
+    if record.run.disc.rec.depth and not best.good:
+        ways.append("steps without depth")
+        best = _without_depth(record, begin) or best
+        if not record.run.disc.rec.depth:
+            return best
+    for name, search in (("pseudo-time steps", _in_pseudo_time), ("full steps", _wandering)):
         if best.good:
             break
         ways.append(name)
@@ -206,8 +208,11 @@ def _rounded(run: Run, length: float, after: float, size: float) -> bool:
     return bool(length <= ROUNDING * run.factor.condition() * size)
 
 
-def _without_depth(record: Record, begin: Iterate, first: Iterate) -> Iterate | None:
-    """The solution where the recursion ends with the fit: far from it deep expansions mislead."""
+def _without_depth(record: Record, begin: Iterate) -> Found | None:
+    """From the solution where the recursion ends with the fit, for far from it deep expansions mislead.
+
+    Where they mislead next to it too, as at the corner of a moving lid, it is the solution, and the run without depth.
+    """
     run, disc = record.run, record.run.disc
     given = disc.stencils if disc.given_stencils else None
     low = discretize(
@@ -224,7 +229,15 @@ def _without_depth(record: Record, begin: Iterate, first: Iterate) -> Iterate | 
         record.steps, record.solves = record.steps + other.steps, record.solves + other.solves
     record.changes += other.changes
     more = disc.rec.size - low.rec.size
-    return found.at._replace(taylor=np.pad(found.at.taylor, ((0, 0), (0, 0), (0, more))))
+    near = found.at._replace(taylor=np.pad(found.at.taylor, ((0, 0), (0, 0), (0, more))))
+    step = record.tried(near)
+    deep = None if step is None else _damped(record, near, step)
+    if deep is not None and deep.good:
+        return deep
+    run.become(other.run)
+    run.messages.append("With a recursion deeper than the order Newton's steps do not settle; this is without depth.")
+    record.rate = other.rate
+    return found
 
 
 def _in_pseudo_time(record: Record, begin: Iterate, first: Iterate) -> Iterate | None:

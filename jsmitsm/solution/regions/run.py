@@ -13,7 +13,7 @@ from jsmitsm.discretization import health
 from jsmitsm.discretization.health import Health
 from jsmitsm.discretization.layout import Class
 from jsmitsm.discretization.leave_one_out import matrix
-from jsmitsm.discretization.operator_kind import prefers_least_squares
+from jsmitsm.discretization.operator_kind import information_travels
 from jsmitsm.discretization.regions.layout import Regions, discretize_regions
 from jsmitsm.discretization.regions.rows import (
     RegionNumbers,
@@ -98,7 +98,7 @@ class RegionsRun(Run):
         for part, own in zip(self.disc.parts, nums.parts):
             if own.degenerate is not None and len(own.degenerate.empty):
                 self._fail_empty(part.ids[own.degenerate.empty])
-            if prefers_least_squares(part.disc, own):
+            if information_travels(part.disc, own):
                 self.object(
                     f"Information travels in the equation of the region {part.name!r}, or is carried faster than it "
                     "spreads between neighbours; the form that suits it is not made for clouds of several regions: "
