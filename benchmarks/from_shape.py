@@ -215,20 +215,33 @@ def main(names: list[str], explore: bool, side: str) -> None:
     if not hp_elements.available():
         raise SystemExit("NGSolve is not installed: pip install ngsolve")
     hp_elements.threads(machine.cores())
-    data = json.loads(DATA.read_text()) if DATA.exists() else {"explored": {}, "lines": {}}
     for name in names or list(SCENES):
         if explore:
             for one in [side] if side else ["ours", "theirs"]:
+                found = explored(name, one)
+                data = _data()
                 kept = [e for e in data["explored"].get(name, []) if e["side"] != one]
-                data["explored"][name] = kept + explored(name, one)
+                data["explored"][name] = kept + found
+                _write(data)
         else:
-            entries = data["explored"][name]
-            data["lines"][name] = {f"{error:.0e}": raced(name, entries, error) for error in ERRORS}
+            entries = _data()["explored"][name]
+            lines = {f"{error:.0e}": raced(name, entries, error) for error in ERRORS}
+            data = _data()
+            data["lines"][name] = lines
             data["machine"] = machine.describe() | {"ngsolve": hp_elements.ngsolve.__version__}
             made = table(data["lines"], data["machine"])
             data["tables"] = {"from-shape": made}
+            _write(data)
             print("\n".join(" | ".join(row) for row in made["rows"] if row[0] == name), flush=True)
-        DATA.write_text(json.dumps(data, indent=1) + "\n")
+
+
+def _data() -> dict[str, Any]:
+    """What is there by now: scenes may run beside one another."""
+    return json.loads(DATA.read_text()) if DATA.exists() else {"explored": {}, "lines": {}}
+
+
+def _write(data: dict[str, Any]) -> None:
+    DATA.write_text(json.dumps(data, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -158,8 +158,12 @@ def cells_near(
 
 
 def root(region: SdfRegion, a: np.ndarray, b: np.ndarray, tolerance: float) -> np.ndarray:
-    """Zeros on the segments from a to b (M, D), whose ends differ in sign: Illinois, bisection every third step."""
+    """Zeros on the segments from a to b (M, D), whose ends differ in sign: Illinois, bisection every third step.
+
+    tolerance: in parts of a segment, of the place or, by the mean slope along it, of the value.
+    """
     fa, fb = region.values(a), region.values(b)
+    small = 0.1 * tolerance * np.abs(fb - fa)
     s, t = np.zeros(len(a)), np.ones(len(a))
     result, live = np.zeros(len(a)), np.arange(len(a))
     for step in range(90):
@@ -171,7 +175,7 @@ def root(region: SdfRegion, a: np.ndarray, b: np.ndarray, tolerance: float) -> n
         left = (f < 0) == (fa < 0)  # the zero lies between u and t
         s, t = np.where(left, u, s), np.where(left, t, u)
         fa, fb = np.where(left, f, fa / 2), np.where(left, fb / 2, f)
-        going = (t - s > tolerance) & (f != 0)
+        going = (t - s > tolerance) & (np.abs(f) > small[live])
         live, s, t, fa, fb = live[going], s[going], t[going], fa[going], fb[going]
         if not len(live):
             break
