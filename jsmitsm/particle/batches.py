@@ -32,8 +32,7 @@ from jsmitsm.runtime.whole_program import COUNT, called, in_one_program, only_ru
 _WIDE = 8192
 # Options of XLA on CPUs. Its matrix products here are too small to share among threads; threads.py does that with whole
 # pieces. Up to so many particles a program is compiled with less effort, in a half or a sixth of the time; what that
-# costs in running is about a millisecond a call. Large systems take five
-# times as long with the least effort.
+# costs in running is about a millisecond a call. Large systems take five times as long with the least effort.
 _ALONE: Any = {"xla_cpu_multi_thread_eigen": False}
 _PLAIN: Any = _ALONE | {"xla_cpu_use_fusion_emitters": False, "xla_cpu_parallel_codegen_split_count": 1}
 QUICKLY: Any = _PLAIN | {"xla_backend_optimization_level": 0}

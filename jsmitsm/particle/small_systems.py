@@ -121,8 +121,8 @@ class GramInverse(NamedTuple):
         return scale * (self.matrix @ (scale * t))
 
 
-# So many outer products are summed in one loop. Up to so many rows a Gram matrix inside of one kernel is faster as a sum
-# of them than as a product; elsewhere it is no faster, and takes a quarter longer to compile.
+# So many outer products are summed in one loop. Up to so many rows a Gram matrix inside of one kernel is faster as a
+# sum of them than as a product; elsewhere it is no faster, and takes a quarter longer to compile.
 _TOGETHER, _MOST_ROWS = 18, 64
 
 
