@@ -7,6 +7,7 @@ tree of the package in turns with this one, as it is and without depth, and writ
 
 from __future__ import annotations
 
+import compileall
 import inspect
 import json
 import math
@@ -190,6 +191,8 @@ def cold(tree: str, flat: bool) -> float:
 def main(other: str) -> None:
     own = str(Path(__file__).parent.parent)
     trees = [(own, True), (own, False)] if not other else [(other, True), (own, True), (own, False)]
+    for tree in {tree for tree, _ in trees}:
+        compileall.compile_dir(Path(tree) / "jsmitsm", quiet=1)  # as pip does when it installs
     servers = []
     for tree, flat in trees:
         where = {**os.environ, "PYTHONPATH": tree}

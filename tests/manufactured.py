@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+from functools import partial
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 import jsmitsm as js
 from benchmarks import scenes
 from benchmarks.problems import SIDES
+from jsmitsm.particle.batches import QUICKLY
 
 METHODS = ("I", "II", "III", "S", "SSPH")
+# For programs that run a few times only: compiling them takes longest.
+quickly = partial(jax.jit, compiler_options=QUICKLY)
 
 
 def jittered(dim: int, n: int, jitter: float = 0.25, seed: int = 1) -> js.Cloud:

@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import manufactured as mm
 import numpy as np
 import pytest
 import scipy.special
@@ -133,11 +134,11 @@ def test_gradients_pass_the_axis_and_the_zero_under_jit_too():
     pde = lambda u, x, p: p * (x[0] * lap(u)(x) + 2.0 * grad(u)(x)[0]) + 6.0 * x[0]  # noqa: E731
     ends = {"left": js.neumann(0.0), "right": js.dirichlet(0.0)}
     top = lambda p: js.solve(js.Problem(pde, ends, params=p), RADIUS).u[0]  # noqa: E731
-    assert abs(jax.jit(top)(2.0) - 0.5) < 1e-11
-    assert abs(jax.grad(top)(2.0) + 0.25) < 1e-10 and abs(jax.jit(jax.grad(top))(2.0) + 0.25) < 1e-10
+    assert abs(mm.quickly(top)(2.0) - 0.5) < 1e-11
+    assert abs(jax.grad(top)(2.0) + 0.25) < 1e-10 and abs(mm.quickly(jax.grad(top))(2.0) + 0.25) < 1e-10
     zero = dict.fromkeys(ends, js.dirichlet(0.0))
     middle = lambda p: js.solve(js.Problem(lambda u, x, p: x[0] * (lap(u)(x) + 2.0 * p), zero, params=p), LINE).u[10]  # noqa: E731
-    assert abs(jax.grad(middle)(3.0) - 1.0) < 1e-10 and abs(jax.jit(middle)(3.0) - 3.0) < 1e-10
+    assert abs(jax.grad(middle)(3.0) - 1.0) < 1e-10 and abs(mm.quickly(middle)(3.0) - 3.0) < 1e-10
 
 
 PLANE = lambda x: jnp.cos(x[0]) * jnp.exp(x[1])  # noqa: E731

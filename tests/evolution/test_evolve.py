@@ -4,6 +4,7 @@ import pickle
 
 import jax
 import jax.numpy as jnp
+import manufactured as mm
 import numpy as np
 import pytest
 
@@ -417,7 +418,7 @@ def test_jit_and_vmap():
     some = jnp.array([0.2, 0.4])
     one = jnp.stack([last(k) for k in some])
     assert np.abs(jax.vmap(last)(some) - one).max() < 1e-12
-    value, found = jax.jit(jax.value_and_grad(last))(some[0])
+    value, found = mm.quickly(jax.value_and_grad(last))(some[0])
     assert abs(value - one[0]) < 1e-12 and abs(found - jax.grad(last)(some[0])) < 1e-9 * abs(found)
 
 

@@ -4,6 +4,7 @@ import pickle
 
 import jax
 import jax.numpy as jnp
+import manufactured as mm
 import numpy as np
 import pytest
 from scipy.special import j0, jn_zeros, jnp_zeros
@@ -190,7 +191,7 @@ def test_gradients_under_jit(plate):
         return js.eigen(problem.replace(params=a), cloud, 1, order=2).values[0]
 
     slope = difference(first, 0.3)
-    value, made = jax.jit(jax.value_and_grad(first))(0.3)
+    value, made = mm.quickly(jax.value_and_grad(first))(0.3)
     assert abs(made - slope) < 1e-6 * abs(slope) and abs(value - first(0.3)) < 1e-10 * value
 
 
