@@ -185,7 +185,7 @@ def _check_seen(region: levelset.SdfRegion, cells: octree.Cells, found: np.ndarr
     x, width = x[doubtful], width[doubtful]
     if not len(x):
         return
-    foot, arrived, outward = region.project(x, width)
+    foot, arrived, outward = region.project(x, width, 1e-3 * float(width.min()), 2.0 * width)
     missed = arrived & (tree.query(foot)[0] > 3 * width) & (np.linalg.norm(foot - x, axis=1) < 2 * width)
     x, width, outward = foot[missed], width[missed], outward[missed]
     # Where two shapes of a union touch, zero is reached from inside on both sides: that is no boundary.
@@ -286,6 +286,7 @@ def _corners(
     if len(curved):
         a[curved], b[curved], na[curved], nb[curved] = _jumps(region, *(v[curved] for v in (a, b, na, nb)))
         curved = curved[np.einsum("md,md->m", na[curved], nb[curved]) < _CORNER]
+    if len(curved):
         points[curved], na[curved], nb[curved] = _meeting(region, *(v[curved] for v in (a, b, na, nb)))
     sharp = np.flatnonzero(np.einsum("md,md->m", na, nb) < _CORNER)
     after, points, na, nb = (v[sharp] for v in (after, points, na, nb))
@@ -346,7 +347,7 @@ def _jumps(
             break
         # Not the exact middle, which may well be a corner of a symmetric shape.
         middle = a[live] + rng.uniform(0.4, 0.6, (len(live), 1)) * (b - a)[live]
-        on, arrived, n = region.project(middle, gap)
+        on, arrived, n = region.project(middle, gap, 1e-6 * float(gap.min()), 3.0 * gap)
         astray = np.flatnonzero(~arrived | (np.linalg.norm(on - middle, axis=1) > 2 * gap))
         if len(astray):
             on[astray] = middle[astray]

@@ -85,8 +85,14 @@ class SdfRegion:
         gradient[~good] = 0.0
         return value / slope, gradient / slope[:, None]
 
-    def project(self, x: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Newton steps of at most ``reach`` (M,) to the zero level; points (M, D), whether they arrived, normals."""
+    def project(
+        self, x: np.ndarray, reach: np.ndarray, near: float = 0.0, roam: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Newton steps of at most ``reach`` (M,) to the zero level; points (M, D), whether they arrived, normals.
+
+        near: a distance that is close enough; roam (M,): those that go farther from where they began are given up.
+        """
+        on, there = max(_ON * self.size, near), max(_ARRIVED * self.size, near)
         found, normal = x.copy(), np.zeros(x.shape)
         best = np.full(len(x), np.inf)
         live, at = np.arange(len(x)), x
@@ -98,13 +104,15 @@ class SdfRegion:
             kept = live[better]
             best[kept], found[kept], normal[kept] = off[better], at[better], outward[better]
             # What no longer improves is as close as its round-off lets it.
-            going = (off > _ON * self.size) & (better | (before > _ARRIVED * self.size))
+            going = (off > on) & (better | (before > there))
+            if roam is not None:
+                going &= np.linalg.norm(at - x[live], axis=1) <= roam[live]
             live = live[going]
             if not len(live):
                 break
             step = np.clip(distance[going], -reach[live], reach[live])
             at = at[going] - step[:, None] * outward[going]
-        return found, best <= _ARRIVED * self.size, normal
+        return found, best <= there, normal
 
     def normals(self, x: np.ndarray) -> np.ndarray:
         """Unit gradients (M, D) at points of the zero level."""
@@ -158,21 +166,35 @@ def cells_near(
 
 
 def root(region: SdfRegion, a: np.ndarray, b: np.ndarray, tolerance: float) -> np.ndarray:
-    """Zeros on the segments from a to b (M, D), whose ends differ in sign: Illinois, bisection every third step."""
-    fa, fb = region.values(a), region.values(b)
-    s, t = np.zeros(len(a)), np.ones(len(a))
-    result, live = np.zeros(len(a)), np.arange(len(a))
-    for step in range(90):
-        with np.errstate(divide="ignore", invalid="ignore"):
-            u = np.where(step % 3 == 2, (s + t) / 2, s - fa * (t - s) / (fb - fa))
-        u = np.clip(np.where(np.isfinite(u), u, (s + t) / 2), s, t)
-        result[live] = u
-        f = region.values(a[live] + u[:, None] * (b - a)[live])
-        left = (f < 0) == (fa < 0)  # the zero lies between u and t
-        s, t = np.where(left, u, s), np.where(left, t, u)
-        fa, fb = np.where(left, f, fa / 2), np.where(left, fb / 2, f)
-        going = (t - s > tolerance) & (f != 0)
-        live, s, t, fa, fb = live[going], s[going], t[going], fa[going], fb[going]
-        if not len(live):
-            break
+    """Zeros on the segments from a to b (M, D), whose ends differ in sign: inverse quadratic interpolation where it is
+    safe, else bisection (Chandrupatla, Adv. Eng. Softw. 28, 1997).
+
+    tolerance: in parts of a segment, of the place or, by the mean slope along it, of the value.
+    """
+    f0, f1 = region.values(a), region.values(b)
+    s0, s1 = np.zeros(len(a)), np.ones(len(a))
+    small = 0.1 * tolerance * np.abs(f1 - f0)
+    result, live = np.where(np.abs(f0) < np.abs(f1), 0.0, 1.0), np.arange(len(a))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        t = np.clip(f1 / (f1 - f0), 0.05, 0.95)
+        for _ in range(90):
+            s = s1 + np.where(np.isfinite(t), t, 0.5) * (s0 - s1)
+            f = region.values(a[live] + s[:, None] * (b - a)[live])
+            same = (f < 0) == (f1 < 0)
+            # The zero lies between s1, the newest, and s0; s2 is the one before.
+            s2, f2 = np.where(same, s1, s0), np.where(same, f1, f0)
+            s0, f0 = np.where(same, s0, s1), np.where(same, f0, f1)
+            s1, f1 = s, f
+            best = np.abs(f0) < np.abs(f1)
+            result[live] = np.where(best, s0, s1)
+            least = np.where(best, np.abs(f0), np.abs(f1))
+            going = (np.abs(s1 - s0) > tolerance) & (least > small[live])
+            live, s0, s1, s2, f0, f1, f2 = (v[going] for v in (live, s0, s1, s2, f0, f1, f2))
+            if not len(live):
+                break
+            place, value = (s1 - s0) / (s2 - s0), (f1 - f0) / (f2 - f0)
+            safe = (value**2 < place) & ((1.0 - value) ** 2 < 1.0 - place)
+            t = f1 / (f0 - f1) * f2 / (f0 - f2) + (s2 - s1) / (s0 - s1) * f1 / (f2 - f1) * f0 / (f2 - f0)
+            edge = 0.5 * tolerance / np.abs(s0 - s1)
+            t = np.clip(np.where(safe, t, 0.5), edge, 1.0 - edge)
     return a + result[:, None] * (b - a)

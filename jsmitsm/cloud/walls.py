@@ -7,7 +7,7 @@ much longer than the straight one. Round a blunt corner or a round hole it is no
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -25,10 +25,22 @@ _LINKS, _CUTTERS = {1: 4, 2: 12, 3: 30}, {1: 4, 2: 10, 3: 20}
 _LONG = 2.3
 # What a boundary particle covers of the boundary, in its distance from the next ones.
 _COVER = {1: 1.0, 2: 0.6, 3: 0.75}
-# Sources of one search for shortest ways.
+# Of a cloud of so many particles all links are made at once. Sources of one search for shortest ways.
+_SMALL = 4000
 _CHUNK = 256
 # A boundary particle has a side: the interior ones next to it lie in one direction (the mean's length).
 _SIDED = 0.35
+
+
+class Links(NamedTuple):
+    """Particles linked to their nearest ones, without the links that leave the domain.
+
+    number (M,): of the particles in the graph, -1 for others; spacing: of the linked ones; graph: lengths.
+    """
+
+    number: np.ndarray
+    spacing: np.ndarray
+    graph: Any
 
 
 class Walls:
@@ -45,6 +57,7 @@ class Walls:
         self.points, self.ids, self.interior, self.groups = points, ids, interior, groups
         self.given = normals
         self.kept: dict[Any, np.ndarray] = {}  # what others found by looking
+        self.links: Links | None = None
         self.place = np.full(len(points), -1)
         self.place[ids] = np.arange(len(ids))
 
@@ -173,42 +186,67 @@ class Walls:
 
     def _behind(self, near: np.ndarray, rows: np.ndarray) -> np.ndarray:
         """Mask (n, w) of the neighbours of some particles to which the way is long."""
-        from scipy.sparse import coo_array
         from scipy.sparse.csgraph import dijkstra
 
-        members = np.unique(np.concatenate([near[near >= 0], rows]))
+        links = self._links(near, rows)
+        number, spacing = links.number, links.spacing
+        out = np.zeros(near.shape, bool)
+        straight = np.sqrt(((self.points[np.maximum(near, 0)] - self.points[rows][:, None]) ** 2).sum(axis=2))
+        allowed = _DETOUR * straight + _SLACK * spacing[number[rows]][:, None]
+        for k in range(0, len(rows), _CHUNK):
+            some = slice(k, k + _CHUNK)
+            limit = float(np.where(near[some] >= 0, allowed[some], 0.0).max())
+            ways = dijkstra(links.graph, directed=False, indices=number[rows[some]], limit=limit)
+            there = ways[np.arange(len(ways))[:, None], number[np.maximum(near[some], 0)]]
+            out[some] = (near[some] >= 0) & ~(there <= allowed[some])
+        return out
+
+    def _links(self, near: np.ndarray, rows: np.ndarray) -> Links:
+        """The links among some particles and their neighbours; those of a small cloud among all, once."""
+        if len(self.points) > _SMALL:
+            return self._linked(np.unique(np.concatenate([near[near >= 0], rows])))
+        if self.links is None:
+            self.links = self._linked(np.arange(len(self.points)))
+        return self.links
+
+    def _linked(self, members: np.ndarray) -> Links:
+        from scipy.sparse import coo_array
+
         number = np.full(len(self.points), -1)
         number[members] = np.arange(len(members))
         at = self.points[members]
         distance, linked = _tree(at).query(at, k=range(1, min(_LINKS[at.shape[1]] + 1, len(at)) + 1))
         spacing = distance[:, 1 : 1 + 2 * at.shape[1]].mean(axis=1)
         a, b = np.repeat(np.arange(len(at)), linked.shape[1] - 1), linked[:, 1:].ravel()
-        a, b = np.unique(np.sort(np.stack([a, b], axis=1), axis=1), axis=0).T
-        length = np.linalg.norm(at[a] - at[b], axis=1)
+        a, b = np.divmod(np.unique(np.minimum(a, b) * len(at) + np.maximum(a, b)), len(at))
+        length = np.sqrt(((at[a] - at[b]) ** 2).sum(axis=1))
         short = length <= _LONG * np.maximum(spacing[a], spacing[b])
         a, b, length = a[short], b[short], length[short]
         keep = ~self._cut(members[a], members[b])
         graph = coo_array((length[keep], (a[keep], b[keep])), shape=(len(at), len(at))).tocsr()
-        out = np.zeros(near.shape, bool)
-        straight = np.linalg.norm(self.points[np.maximum(near, 0)] - self.points[rows][:, None], axis=2)
-        allowed = _DETOUR * straight + _SLACK * spacing[number[rows]][:, None]
-        for k in range(0, len(rows), _CHUNK):
-            some = slice(k, k + _CHUNK)
-            limit = float(np.where(near[some] >= 0, allowed[some], 0.0).max())
-            ways = dijkstra(graph, directed=False, indices=number[rows[some]], limit=limit)
-            there = ways[np.arange(len(ways))[:, None], number[np.maximum(near[some], 0)]]
-            out[some] = (near[some] >= 0) & ~(there <= allowed[some])
-        return out
+        return Links(number, spacing, graph)
 
     def _cut(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
         """Mask of the links between particles ``a`` and ``b`` that leave the domain."""
         owner, normal, cover = self._surfels(np.unique(np.concatenate([a, b])))
+        out = np.zeros(len(a), bool)
         if not len(owner):
-            return np.zeros(len(a), bool)
+            return out
+        count = min(_CUTTERS[self.points.shape[1]], len(owner))
         x, y = self.points[a], self.points[b]
-        length = np.linalg.norm(x - y, axis=1)[:, None]
-        count = min(_CUTTERS[x.shape[1]], len(owner))
-        near = _tree(self.points[owner]).query((x + y) / 2.0, k=range(1, count + 1))[1]
+        reach = np.sqrt(((x - y) ** 2).sum(axis=1)) / 2.0 + cover.max()
+        away, near = _tree(self.points[owner]).query((x + y) / 2.0, k=range(1, count + 1))
+        # The boundary is far from most.
+        some = np.flatnonzero(away[:, 0] <= 1.01 * reach)
+        out[some] = self._leaving(a[some], b[some], owner, normal, cover, near[some])
+        return out
+
+    def _leaving(
+        self, a: np.ndarray, b: np.ndarray, owner: np.ndarray, normal: np.ndarray, cover: np.ndarray, near: np.ndarray
+    ) -> np.ndarray:
+        """Mask of the links that leave the domain between the pieces ``near`` (links, k) of its boundary."""
+        x, y = self.points[a], self.points[b]
+        length = np.sqrt(((x - y) ** 2).sum(axis=1))[:, None]
         at, n = self.points[owner][near], normal[near]
         one, two = (np.einsum("ekd,ekd->ek", z[:, None] - at, n) for z in (x, y))
         from_a, from_b = owner[near] == a[:, None], owner[near] == b[:, None]

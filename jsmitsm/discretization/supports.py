@@ -20,7 +20,7 @@ from jsmitsm.particle.recursion import fit_and_tail
 from jsmitsm.runtime.tracers import concrete, is_traced
 
 # Neighbours for every free coefficient, by the order of the expansions, where the particles are evenly spaced.
-_EVEN_RATIO = {4: 1.5, 5: 1.5, 6: 1.5, 7: 1.65, 8: 1.65}
+_EVEN_RATIO = {4: 1.5, 5: 1.5, 6: 1.5, 7: 1.65, 8: 1.65, 9: 1.8, 10: 1.8, 11: 1.8, 12: 1.8}
 # Particles whose given stencils are compared with their supports, at the most.
 _LOOKED_AT = 500
 

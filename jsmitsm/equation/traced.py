@@ -119,6 +119,8 @@ class Traced:
         return tuple((x.shape, x.dtype.str, x.tobytes()) for x in map(np.asarray, some))
 
     def _linear(self, inputs: _Inputs, degree: int) -> tuple[Any, Any]:
+        if not (self.constant or is_traced(inputs) or (self.source == "zero" and inputs.slots is None)):
+            return self._compute(inputs, degree, True, True)
         # Apart: a coefficient that rests on nothing traced stays on the host.
         jac = self._one_for_all(inputs) if self.constant else self._compute(inputs, degree, True, False)[0]
         if self.source == "zero" and inputs.slots is None:
@@ -144,6 +146,10 @@ class Traced:
         leaves = [np.zeros(a.shape, a.dtype) for a in rest[self._n_extras :]]
         inputs = _Inputs(np.zeros((1, self.dim)), zeros, leaves, list(self._record.consts), None)
         return frozen(self._compute(inputs, 0, True, False)[0])
+
+    def leading(self, points: Any, params: Any) -> Any:
+        """The coefficients alone (E, S, N) of a linear operator at the points."""
+        return self._compute(self._inputs(points, 0, (), params, None), 0, True, False)[0][:, :, 0]
 
     def residuals(self, points: Any, *, params: Any = None, slots: Any = None) -> Any:
         """The residual alone (E, N) at the points, where the slots' derivatives are ``slots`` (S, N) or zero."""

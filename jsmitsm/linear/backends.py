@@ -10,6 +10,7 @@ led nowhere, which a small residual can hide where the matrix is singular.
 from __future__ import annotations
 
 import importlib.util
+import sys
 from collections.abc import Callable
 from copy import copy
 from functools import cache
@@ -103,7 +104,7 @@ class Pardiso:
         return self.solver.solve(self.matrix.T if transpose else self.matrix, b)
 
     def __del__(self) -> None:
-        if hasattr(self, "matrix"):
+        if hasattr(self, "matrix") and not sys.is_finalizing():
             self.solver.free_memory(everything=True)
 
 

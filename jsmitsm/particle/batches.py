@@ -19,7 +19,7 @@ from jsmitsm.particle.closure import Recovery
 from jsmitsm.particle.elimination import Elimination, Scheme, eliminate
 from jsmitsm.particle.kernels import Kernel
 from jsmitsm.particle.moments import Block, Row, Support
-from jsmitsm.particle.recursion import row_lifts
+from jsmitsm.particle.recursion import fit_and_tail, row_lifts
 from jsmitsm.particle.source_fit import source_weights
 from jsmitsm.runtime import one_kernel
 from jsmitsm.runtime.compiled import at_hand
@@ -32,7 +32,7 @@ from jsmitsm.runtime.whole_program import COUNT, called, in_one_program, only_ru
 _WIDE = 8192
 # Options of XLA on CPUs. Its matrix products here are too small to share among threads; threads.py does that with whole
 # pieces. Up to so many particles a program is compiled with less effort, in a half or a sixth of the time; what that
-# costs in running is about a millisecond a call.
+# costs in running is about a millisecond a call. Large systems take five times as long with the least effort.
 _ALONE: Any = {"xla_cpu_multi_thread_eigen": False}
 _PLAIN: Any = _ALONE | {"xla_cpu_use_fusion_emitters": False, "xla_cpu_parallel_codegen_split_count": 1}
 QUICKLY: Any = _PLAIN | {"xla_backend_optimization_level": 0}
@@ -41,6 +41,8 @@ _EFFORT = (
     (2048, _PLAIN | {"xla_backend_optimization_level": 1}),
     (np.inf, _ALONE),
 )
+# Fits of so many columns are large.
+_LARGE = 28
 # Up to so many Taylor coefficients, or so many where all share an elimination, one kernel is faster than many and
 # a library's matrix products.
 _SMALL, _SMALL_SHARED = 32, 66
@@ -101,9 +103,9 @@ def _first(x: np.ndarray, m: int) -> np.ndarray:
     return x[:m] if len(x) <= 1.25 * m else x[:m].copy()
 
 
-def effort(size: int) -> Any:
-    """The compiler's options for programs over so many particles."""
-    return on_cpu(next(some for most, some in _EFFORT if size <= most))
+def effort(size: int, columns: int = 0) -> Any:
+    """The compiler's options for programs over so many particles, whose fits have so many columns."""
+    return on_cpu(next(some for most, some in _EFFORT if size + (columns >= _LARGE) <= most))
 
 
 def _by_row(points: Any, kernel: Any, ids: Any, neighbours: Any, given: Operands, each: Any, whole: Any) -> Any:
@@ -142,7 +144,7 @@ def _in_size_classes(function: Any) -> Any:
         arguments = dict(zip(names, (points, kernel, ids, neighbours, given, each, whole)))
         if inside or (kernel is not None and closes_over_traced(kernel.tree_flatten()[1])):
             return cut(inner(scheme, **arguments), m)
-        options = effort(size)
+        options = effort(size, len(fit_and_tail(scheme.rec)[0]))
         most = _SMALL if operands.shared is None else _SMALL_SHARED
         small = scheme.rec.size * scheme.rec.fields <= most and one_kernel.available()
         share = None if loose else dict(zip(names, _by_row(points, kernel, ids, neighbours, given, each, whole)))

@@ -18,6 +18,7 @@ from jsmitsm.runtime.recall.recording import recalled
 from jsmitsm.runtime.snapshot import snapshot
 from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.taylor import jets, series
+from jsmitsm.taylor.first_degree import first_degree
 
 # Points of one call of a compiled program, which is compiled for these two numbers only.
 _CALLS = (512, 8192)
@@ -48,6 +49,9 @@ class Recorded:
         return self._compiled(x)
 
     def _interpreted(self, x: np.ndarray, gradients: bool) -> tuple[np.ndarray, np.ndarray]:
+        steps = first_degree(self._closed.jaxpr)
+        if steps is not None:
+            return steps(self._closed.consts, x, gradients)
         degree = int(gradients)
         closed, point = self._closed, series.variable(np.ascontiguousarray(x), degree)
         (out,) = jets.evaluate(closed.jaxpr, closed.consts, [point], self._dim, degree)

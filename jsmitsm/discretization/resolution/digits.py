@@ -73,9 +73,9 @@ def _peclet(rec: Recursion, traced: Traced, cloud: Cloud, params: Any, part: Par
     sample = points[:: max(1, len(points) // LOOKED_AT)]
     if part is not None:
         sample, spacing = part.sample, part.spacing
-    jac, _ = traced.coefficients(sample, 0, params=params)
+    jac = traced.leading(sample, params)
     if is_traced(jac):
         return 0.0
-    jac = np.asarray(jac)[0, :, 0]
+    jac = np.asarray(jac)[0]
     speed, diffusion = np.linalg.norm(jac[drift], axis=0), np.abs(jac[second]).max(axis=0)
     return float(np.median(speed * spacing / np.where(diffusion > 0, diffusion, np.inf)))
