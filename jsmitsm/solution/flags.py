@@ -47,6 +47,8 @@ PECLET = 1.0
 ROUND_OFF = 1e-2
 # A field's range below this part of its values is round-off, and so is a field below this part of the largest.
 FLAT, NOTHING = 1e-9, 1e-10
+# ... and in the least-squares form, whose systems are squared.
+SQUARED = 1e-6
 # Coordinates rounded by this part of the spacing put the particles somewhere else.
 ROUNDED = 1e-3
 # (k s)^(p+1) cells, with s the spacing: the phase error a wave gathers across the domain. By order, as above.
@@ -122,11 +124,14 @@ def _cleared(run: Any, found: dict[str, float], doubts: list[str]) -> bool:
     return all(found.get(name, 0.0) <= limit for name, limit in limits.items())
 
 
-def share(error: np.ndarray, values: np.ndarray) -> float:
-    """Errors (N, F) over the values (N, F), of the worst field: each has a scale of its own."""
+def share(error: np.ndarray, values: np.ndarray, nothing: float = NOTHING) -> float:
+    """Errors (N, F) over the values (N, F), of the worst field: each has a scale of its own.
+
+    nothing : a field below this part of the largest is taken for zero.
+    """
     size = np.abs(values).max(initial=0.0) or 1.0  # no square overflows
     fields = np.linalg.norm(values / size, axis=0)
-    scale = np.maximum(fields, NOTHING * fields.max(initial=0.0))
+    scale = np.maximum(fields, nothing * fields.max(initial=0.0))
     return float(np.max(np.linalg.norm(error / size, axis=0) / np.where(scale > 0, scale, 1.0)))
 
 

@@ -17,7 +17,7 @@ from jsmitsm.runtime.tracers import frozen, is_traced, owned
 from jsmitsm.solution.anywhere import Anywhere
 from jsmitsm.solution.estimate import Correction, correction
 from jsmitsm.solution.fit import Recipe
-from jsmitsm.solution.flags import share
+from jsmitsm.solution.flags import NOTHING, SQUARED, share
 
 # An estimated error above this part of the solution is a flag.
 LARGE = 0.02
@@ -157,7 +157,9 @@ class Solution(Anywhere):
     def _kept(self, error: Array) -> Array:
         if not is_traced(error, self._values):
             self._error = frozen(error)
-            self._share = share(np.reshape(error, np.shape(self._values)), np.asarray(self._values))
+            # The least-squares form has the squares of the systems: what is left of a field that is zero is larger.
+            nothing = SQUARED if self._recipe.formulation == "lsq" else NOTHING
+            self._share = share(np.reshape(error, np.shape(self._values)), np.asarray(self._values), nothing)
         return error
 
     @property

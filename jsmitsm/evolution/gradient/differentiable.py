@@ -78,7 +78,8 @@ def _inputs(
 @in_one_program
 def _mixed(values: Any, windows: np.ndarray, blend: np.ndarray) -> Any:
     """Boundary data at the start and at all stages from those (n, samples) at the nodes; see Sampling."""
-    return jnp.concatenate([values[:, :1], (values[:, windows] @ blend.T).reshape(len(values), -1)], axis=1)
+    stages = len(windows) * len(blend)  # said, for there may be no values
+    return jnp.concatenate([values[:, :1], (values[:, windows] @ blend.T).reshape(len(values), stages)], axis=1)
 
 
 def _saved(semi: Semidiscrete, parts: np.ndarray, steps: int, m: int, found: Any, held: list[Any]) -> list[Any]:
