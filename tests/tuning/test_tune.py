@@ -252,7 +252,10 @@ def test_a_nonlinear_problem():
 @pytest.mark.parametrize(
     "change, said",
     [
-        ({"parameters": ("h", "sigma")}, r"parameters: 'sigma' is no parameter of SuperGaussian; it has 'h', 'd' \(docs: gradients\)$"),
+        (
+            {"parameters": ("h", "sigma")},
+            r"parameters: 'sigma' is no parameter of SuperGaussian; it has 'h', 'd' \(docs: gradients\)$",
+        ),
         ({"parameters": ("params",)}, "it has 'h', 'd'"),
         ({"parameters": ()}, "parameters: expected some of 'h', 'd'"),
         ({"parameters": ("h", "h")}, "each once"),
