@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache, cached_property
 from typing import Any
 
 import jax.numpy as jnp
@@ -40,18 +41,25 @@ class Correction:
     """What an estimate knows besides the size of the error.
 
     error (N, F): the estimated u_exact - u, with its sign.
-    defect (N, F): by how much every value misses its prediction by rows of a higher order, in the scale of u: what
-    each particle contributes to the error, which is about the inverse of the global matrix times this. In the
-    least-squares form the misfit of its local fit; None for the methods other than S, which have neither.
+    made: the defect (N, F), for ``defect``; None for the methods other than S, which have none.
     adjoint: of weights (N, F) of the values in a number, those of the defects in it; None where there are no rows.
     """
 
     error: Any
-    defect: Any
+    made: Callable[[], Any] | None
     adjoint: Callable[[np.ndarray], np.ndarray] | None
 
+    @cached_property
+    def defect(self) -> Any:
+        """By how much every value misses its prediction by rows of a higher order, in the scale of u, (N, F).
 
-@bar("error estimate", parts=(("local fits", 1.0), ("local fits", 3.0), ("unknowns", 1.0)))
+        What each particle contributes to the error, which is about the inverse of the global matrix times this. In the
+        least-squares form the misfit of its local fit. Made when asked for: an error estimate does without.
+        """
+        return None if self.made is None else self.made()
+
+
+@bar("error estimate", parts=(("local fits", 3.0), ("unknowns", 1.0)))
 def correction(fit: Fit, values: Any) -> Correction:
     """The estimated error of the values (N, F), and what it comes from.
 
@@ -70,23 +78,19 @@ def correction(fit: Fit, values: Any) -> Correction:
     low = fit.discretization()
     if fit.recipe.formulation == "lsq" or fit.recipe.method != "S":
         return _against(fit, low, values)
-    run = Run(low, fit.problem, "auto", True, False, "loo")
-    nums = numbers(low, fit.problem, fit.taylor)
-    classes, rows = all_rows(low, nums)
     order = _beside(fit, low)
     high, high_nums = _of_order(fit, low, order)
     above = Run(high, fit.problem, "auto", True, True, "loo")
     high_rows = above.local_rows(high_nums)
-    defect = _per_value(high, *high_rows, high_nums, values)
-    own = _per_value(low, classes, rows, nums, values)
-    free = np.flatnonzero(~low.held.reshape(-1))
+    entries = matrix(high, *high_rows)
+    residual = _residual(high, *high_rows, high_nums, entries, values)
     trust = _trust(high, *high_rows)
-    weighed = _one_scale(own[1], defect[1], low) * trust * defect[0]
-    data, r, c = matrix(low, classes, rows)
-    try:
-        x, _ = above.solved(*matrix(high, *high_rows), defect[0].reshape(-1)[free], balanced=False)
-    except SolveError:
-        x, _ = run.solved(data, r, c, weighed.reshape(-1)[free], balanced=False)
+    free = np.flatnonzero(~low.held.reshape(-1))
+    run = Run(low, fit.problem, "auto", True, False, "loo")
+    own = cache(lambda: all_rows(low, numbers(low, fit.problem, fit.taylor)))
+
+    def defect() -> Any:
+        return _one_scale(_weights(low, *own()), _weights(high, *high_rows), low) * trust * residual
 
     def spread(x: Any) -> Any:
         zero = np.zeros(low.held.size)
@@ -95,12 +99,16 @@ def correction(fit: Fit, values: Any) -> Correction:
 
     def adjoint(weights: np.ndarray) -> np.ndarray:
         right = np.concatenate([weights.reshape(-1)[free], np.zeros(len(low.floating))])
-        return spread(run.factor_of(data, r, c).solve(right, transpose=True)[: len(free)])
+        return spread(run.factor_of(*matrix(low, *own())).solve(right, transpose=True)[: len(free)])
 
+    try:
+        x, _ = above.solved(*entries, residual.reshape(-1)[free], balanced=False)
+    except SolveError:
+        x, _ = run.solved(*matrix(low, *own()), defect().reshape(-1)[free], balanced=False)
     error = spread(x)
     if order > fit.recipe.order >= HIGH and not is_traced(error, trust) and trust.min(initial=1.0) < TRUSTED:
         error = _doubted(fit, low, values, error)
-    return Correction(error, weighed, adjoint)
+    return Correction(error, defect, adjoint)
 
 
 def _one_scale(mine: Any, theirs: Any, disc: Discretization) -> Any:
@@ -137,14 +145,16 @@ def _trust(disc: Discretization, classes: list[Class], rows: list[Row]) -> Any:
 
 def _against(fit: Fit, low: Discretization, values: Any) -> Correction:
     """What leads to the solution by method S of order p + 2."""
-    order, missed = _beside(fit, low), None
+    order = _beside(fit, low)
     error = _towards(fit, low, values, order)
-    if fit.recipe.formulation == "lsq" and not is_traced(error):
+    if fit.recipe.formulation != "lsq" or is_traced(error):
+        return Correction(error, None, None)
+
+    def missed() -> Any:
         nums = numbers(low, fit.problem, fit.taylor)
-        missed = np.zeros(low.held.shape)
-        missed[nums.ids] = misfit(low, nums, values)[:, None]
-        error = error if order < fit.recipe.order else _doubted(fit, low, values, error)
-    return Correction(error, missed, None)
+        return _put(np.zeros(low.held.shape), nums.ids, misfit(low, nums, values)[:, None])
+
+    return Correction(error if order < fit.recipe.order else _doubted(fit, low, values, error), missed, None)
 
 
 def _towards(fit: Fit, low: Discretization, values: Any, order: int) -> Any:
@@ -230,27 +240,27 @@ def _of_order(fit: Fit, low: Discretization, order: int) -> tuple[Discretization
     return other, numbers(other, fit.problem, taylor)
 
 
-def _per_value(disc: Discretization, classes: Any, rows: Any, nums: Numbers, values: Any) -> tuple[Any, Any]:
-    """The residual b - A u of every row, and the weight of the source in it, both (N, F)."""
+def _residual(disc: Discretization, classes: Any, rows: Any, nums: Numbers, entries: Any, values: Any) -> Any:
+    """The residual b - A u of every row (N, F), by the entries of A."""
     traced = is_traced(rows, values)
-    xp = jnp if traced else np
-    b = right_side(disc, nums, classes, rows)
-    data, r, c = matrix(disc, classes, rows)
+    data, r, c = entries
     free = np.flatnonzero(~disc.held.reshape(-1))
-    u = xp.asarray(values).reshape(-1)[free]
-    au = xp.zeros(len(free)).at[r].add(data * u[c]) if traced else np.bincount(r, data * u[c], len(free))
-    residual, weight = xp.zeros(disc.held.size), xp.ones(disc.held.size)
+    u = (jnp if traced else np).asarray(values).reshape(-1)[free]
+    au = jnp.zeros(len(free)).at[r].add(data * u[c]) if traced else np.bincount(r, data * u[c], len(free))
+    left = right_side(disc, nums, classes, rows) - au
+    zero = np.zeros(disc.held.size)
+    every: Any = jnp.asarray(zero).at[free].set(left) if traced else _put(zero, free, left)
+    return every.reshape(disc.held.shape)
+
+
+def _weights(disc: Discretization, classes: Any, rows: Any) -> Any:
+    """The weight of the source in every row (N, F)."""
+    traced = is_traced(rows)
+    xp = jnp if traced else np
     first = np.array(disc.rec.equation_rows)
-    parts = [_strongest(xp.asarray(row.source)[:, :, first], xp) for row in rows]
-    ids = np.concatenate([cls.ids for cls in classes])
-    strength = xp.concatenate(parts)
-    if traced:
-        residual = residual.at[free].set(b - au)
-        return residual.reshape(disc.held.shape), weight.reshape(disc.held.shape).at[ids].set(strength)
-    residual[free] = b - au
-    weight = weight.reshape(disc.held.shape)
-    weight[ids] = strength
-    return residual.reshape(disc.held.shape), weight
+    strength = xp.concatenate([_strongest(xp.asarray(row.source)[:, :, first], xp) for row in rows])
+    ids, one = np.concatenate([cls.ids for cls in classes]), np.ones(disc.held.shape)
+    return jnp.asarray(one).at[ids].set(strength) if traced else _put(one, ids, strength)
 
 
 def _strongest(weights: Any, xp: Any) -> Any:
