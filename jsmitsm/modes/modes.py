@@ -16,7 +16,7 @@ from jsmitsm.modes.estimate import errors
 from jsmitsm.modes.question import Question, mass_at
 from jsmitsm.modes.spectrum import Pairs
 from jsmitsm.runtime.arrays import Array, ArrayLike
-from jsmitsm.runtime.errors import explained, short, some
+from jsmitsm.runtime.errors import explained, explaining, short, some
 from jsmitsm.runtime.tracers import frozen, is_traced, owned
 from jsmitsm.solution.fit import Fit, Recipe
 from jsmitsm.solution.regions.fit import RegionsFit
@@ -89,6 +89,7 @@ class Modes:
     def __len__(self) -> int:
         return int(np.shape(self._values)[-1])
 
+    @explaining
     def __call__(self, k: int, points: ArrayLike, *, blend: bool = False, outside: str = "nan") -> jax.Array:
         """A mode anywhere.
 
@@ -123,6 +124,7 @@ class Modes:
         """
         return self._between(k)(points, blend=blend, outside=outside)
 
+    @explaining
     def grad(self, k: int, points: ArrayLike, *, blend: bool = False, outside: str = "nan") -> jax.Array:
         """The gradient of a mode anywhere.
 
@@ -157,6 +159,7 @@ class Modes:
         """
         return self._between(k).grad(points, blend=blend, outside=outside)
 
+    @explaining
     def derivative(self, k: int, points: ArrayLike, multi_index: Sequence[int], *, outside: str = "nan") -> jax.Array:
         """Any derivative d^b of a mode anywhere.
 
@@ -254,6 +257,7 @@ class Modes:
             raise ValueError(f"{what}: these Modes were made under a JAX transform, or not found; ask outside of it")
         return self._found
 
+    @explaining
     def error_estimate(self) -> np.ndarray:
         """Estimated errors of the values, by the pencil of order p + 2, assembled when first asked for.
 

@@ -18,6 +18,7 @@ from jsmitsm.cloud.neighbours import Stencils
 from jsmitsm.cloud.regions.region_cloud import RegionCloud
 from jsmitsm.cloud.triangulation import simplices
 from jsmitsm.particle.kernels import Kernel
+from jsmitsm.runtime.errors import explaining
 from jsmitsm.show import drawing
 from jsmitsm.show.drawing import COLOURS, GREY, MARKERS
 from jsmitsm.show.histories import adaptation, convergence, sparsity, tuning
@@ -30,6 +31,7 @@ __all__ = ["adaptation", "animate", "cloud", "convergence", "deformed", "error",
            "solid", "solution", "sparsity", "streamlines", "tuning", "values", "vectors"]  # fmt: skip
 
 
+@explaining
 def cloud(what: Cloud | Solution, *, normals: bool = False, support: int | None = None, kernel: Kernel | None = None,
           stencils: Stencils | None = None, legend: bool = True, ax: Any = None) -> Any:  # fmt: skip
     """The particles of a cloud, coloured by group; 1D, 2D or 3D.
@@ -97,6 +99,7 @@ def cloud(what: Cloud | Solution, *, normals: bool = False, support: int | None 
     return ax
 
 
+@explaining
 def solution(sol: Solution, *, field: int = 0, exact: Any = None, at: Mapping[str, float] | None = None,
              levels: int = 20, colorbar: bool = True, ax: Any = None) -> Any:  # fmt: skip
     """A solution: a curve in 1D, filled contours over the true shape in 2D, slices in 3D.
@@ -138,9 +141,7 @@ def solution(sol: Solution, *, field: int = 0, exact: Any = None, at: Mapping[st
     >>> problem = js.Problem(lambda u, x: js.laplacian(u)(x) + 1.0, ends)
     >>> ax = js.plot.solution(js.solve(problem, js.interval(0.0, 1.0, 9)))
     """
-    if not isinstance(sol, Solution):
-        raise ValueError(f"sol: expected a js.Solution, got {type(sol).__name__}; plain numbers are for js.plot.values")
-    sol.refuse_stacked()
+    _of(sol).refuse_stacked()
     numbers = drawing.field_of(sol.u, field)
 
     def anywhere(points, **side):
@@ -167,6 +168,7 @@ def solution(sol: Solution, *, field: int = 0, exact: Any = None, at: Mapping[st
     return ax
 
 
+@explaining
 def fields(sol: Solution, *, names: Sequence[str] | None = None, ax: Any = None, **options: Any) -> Any:
     """Every field of a system, side by side.
 
@@ -200,9 +202,7 @@ def fields(sol: Solution, *, names: Sequence[str] | None = None, ax: Any = None,
     >>> beam = js.solve(js.Problem(pde, ends, fields=2), js.interval(0.0, 1.0, 9))
     >>> axes = js.plot.fields(beam, names=["deflection", "moment"])
     """
-    if not isinstance(sol, Solution):
-        raise ValueError(f"sol: expected a js.Solution, got {type(sol).__name__}; plain numbers are for js.plot.values")
-    sol.refuse_stacked()
+    _of(sol).refuse_stacked()
     count = 1 if np.ndim(sol.u) == 1 else sol.u.shape[1]
     titles = names_of(names, count)
     if sol.cloud.dim == 3:
@@ -220,6 +220,12 @@ def fields(sol: Solution, *, names: Sequence[str] | None = None, ax: Any = None,
     return axes
 
 
+def _of(sol: Any) -> Solution:
+    if not isinstance(sol, Solution):
+        raise ValueError(f"sol: expected a js.Solution, got {type(sol).__name__}; plain numbers are for js.plot.values")
+    return sol
+
+
 def _regions(cloud: Cloud) -> list[tuple[Cloud, dict[str, str]]]:
     """A cloud, or those of its regions, and what a solution needs to be told of them."""
     if isinstance(cloud, RegionCloud):
@@ -227,6 +233,7 @@ def _regions(cloud: Cloud) -> list[tuple[Cloud, dict[str, str]]]:
     return [(cloud, {})]
 
 
+@explaining
 def values(cloud: Cloud, numbers: Any, *, log: bool = False, label: str = "", at: Mapping[str, float] | None = None,
            levels: int = 20, colorbar: bool = True, ax: Any = None) -> Any:  # fmt: skip
     """Any numbers at the particles as a map.
@@ -280,6 +287,7 @@ def values(cloud: Cloud, numbers: Any, *, log: bool = False, label: str = "", at
     return ax
 
 
+@explaining
 def error(sol: Solution, exact: Any, *, field: int = 0, log: bool = True, ax: Any = None, **options: Any) -> Any:
     """The error |u - exact| at the particles.
 
@@ -312,7 +320,7 @@ def error(sol: Solution, exact: Any, *, field: int = 0, log: bool = True, ax: An
     ...                      {"left": js.dirichlet(0.0), "right": js.dirichlet(1.0)})
     >>> ax = js.plot.error(js.solve(problem, js.interval(0.0, 1.0, 9), order=2), lambda x: x[0] ** 4)
     """
-    sol.refuse_stacked()
+    _of(sol).refuse_stacked()
     truth = drawing.at_points(exact, np.asarray(sol.cloud.points)) if callable(exact) else exact
     truth = drawing.field_of(drawing.real("exact", truth), field)
     if truth.shape != (len(sol.cloud),):
@@ -321,6 +329,7 @@ def error(sol: Solution, exact: Any, *, field: int = 0, log: bool = True, ax: An
     return values(sol.cloud, numbers, log=log, ax=ax, **{"label": "error"} | options)
 
 
+@explaining
 def estimate(sol: Solution, *, field: int = 0, log: bool = True, ax: Any = None, **options: Any) -> Any:
     """The estimated error at the particles, ``js.Solution.error_estimate``, as a map.
 
@@ -346,5 +355,5 @@ def estimate(sol: Solution, *, field: int = 0, log: bool = True, ax: Any = None,
     ...                      {"left": js.dirichlet(0.0), "right": js.dirichlet(1.0)})
     >>> ax = js.plot.estimate(js.solve(problem, js.interval(0.0, 1.0, 9), order=2))
     """
-    numbers = np.abs(drawing.field_of(sol.error_estimate(), field))
+    numbers = np.abs(drawing.field_of(_of(sol).error_estimate(), field))
     return values(sol.cloud, numbers, log=log, ax=ax, **{"label": "estimated error"} | options)

@@ -9,6 +9,7 @@ import numpy as np
 
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.cloud.triangulation import boundary_facets, simplices
+from jsmitsm.runtime.errors import explaining
 from jsmitsm.show import drawing
 from jsmitsm.show.pieces import AXES, pieces
 from jsmitsm.solution.solution import Solution
@@ -16,6 +17,7 @@ from jsmitsm.solution.solution import Solution
 _ENGINES = ("auto", "pyvista", "matplotlib")
 
 
+@explaining
 def solid(sol: Solution, *, field: int = 0, cut: Mapping[str, float] | None = None, engine: str = "auto",
           ax: Any = None) -> Any:  # fmt: skip
     """The surface of a solid, coloured by the solution, opened by cuts.

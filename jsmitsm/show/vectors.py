@@ -11,6 +11,7 @@ import numpy as np
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.cloud.regions.region_cloud import RegionCloud
 from jsmitsm.cloud.triangulation import boundary_facets
+from jsmitsm.runtime.errors import explaining
 from jsmitsm.show import drawing
 from jsmitsm.show.drawing import COLOURS
 from jsmitsm.show.pieces import Piece, clipped, outline, pieces
@@ -20,6 +21,7 @@ from jsmitsm.solution.solution import Solution
 _INK = "0.2"
 
 
+@explaining
 def vectors(sol: Solution, *, of: Callable | None = None, count: int = 20, ax: Any = None) -> Any:
     """Arrows of a vector field, in 2D and 3D.
 
@@ -72,6 +74,7 @@ def vectors(sol: Solution, *, of: Callable | None = None, count: int = 20, ax: A
     return ax
 
 
+@explaining
 def streamlines(sol: Solution, *, of: Callable | None = None, density: float = 1.0, ax: Any = None) -> Any:
     """Stream lines of a vector field in 2D.
 
@@ -119,6 +122,7 @@ def streamlines(sol: Solution, *, of: Callable | None = None, density: float = 1
     return ax
 
 
+@explaining
 def deformed(sol: Solution, *, scale: float | None = None, colour: Callable | None = None, label: str = "displacement",
              levels: int = 20, ax: Any = None) -> Any:  # fmt: skip
     """The deformed shape of a body, of which the first D fields are displacements, in 2D and 3D.
@@ -194,6 +198,7 @@ def deformed(sol: Solution, *, scale: float | None = None, colour: Callable | No
     return ax
 
 
+@explaining
 def principal(sol: Solution, stress: Callable, *, count: int = 20, ax: Any = None) -> Any:
     """Principal stresses in 2D: crosses along their directions, tension in orange and compression in blue.
 

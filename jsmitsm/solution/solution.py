@@ -172,6 +172,7 @@ class Solution(Anywhere):
         """Whether the estimate knows defects, and ``correction`` more than the size of the error."""
         return not hasattr(self._fit, "error_estimate")
 
+    @explaining
     def correction(self) -> Correction:
         """What the error estimate is made of, for those who refine by it.
 
@@ -227,6 +228,7 @@ class Solution(Anywhere):
         found = [*(self._found or []), *self.stats.get("objections", []), *([] if self._share <= LARGE else [large])]
         return explained(found)
 
+    @explaining
     def condition_numbers(self) -> tuple[np.ndarray, float]:
         """Condition numbers of every particle's moment matrix and of the global system.
 
