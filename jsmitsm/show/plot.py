@@ -23,7 +23,7 @@ from jsmitsm.show import drawing
 from jsmitsm.show.drawing import COLOURS, GREY, MARKERS
 from jsmitsm.show.histories import adaptation, convergence, sparsity, tuning
 from jsmitsm.show.series import animate
-from jsmitsm.show.solid import solid
+from jsmitsm.show.solid import solid, solids
 from jsmitsm.show.vectors import deformed, names_of, principal, streamlines, vectors
 from jsmitsm.solution.solution import Solution
 
@@ -101,7 +101,7 @@ def cloud(what: Cloud | Solution, *, normals: bool = False, support: int | None 
 
 @explaining
 def solution(sol: Solution, *, field: int = 0, exact: Any = None, at: Mapping[str, float] | None = None,
-             levels: int = 20, colorbar: bool = True, ax: Any = None) -> Any:  # fmt: skip
+             levels: int = 20, colorbar: bool = True, label: str | None = None, ax: Any = None) -> Any:  # fmt: skip
     """A solution: a curve in 1D, filled contours over the true shape in 2D, slices in 3D.
 
     Between the particles the local polynomials are drawn, not straight lines.
@@ -120,6 +120,8 @@ def solution(sol: Solution, *, field: int = 0, exact: Any = None, at: Mapping[st
         About how many contour levels.
     colorbar : bool
         Draw one, for 2D and 3D.
+    label : str, optional
+        What is drawn, with its unit, ``"temperature (K)"``; ``u`` or ``u[k]`` if not given.
     ax : Axes or array of Axes, optional
         Axes; in 3D one for every slice.
 
@@ -147,9 +149,9 @@ def solution(sol: Solution, *, field: int = 0, exact: Any = None, at: Mapping[st
     def anywhere(points, **side):
         return drawing.field_of(sol(points, blend=True, outside="extrapolate", **side), field)
 
-    label = "u" if np.ndim(sol.u) == 1 else f"u[{field}]"
+    name = drawing.name_of(sol, field, label)
     if sol.cloud.dim > 1:
-        return drawing.maps(sol.cloud, numbers, anywhere, at, levels, colorbar, ax, label, log=False)
+        return drawing.maps(sol.cloud, numbers, anywhere, at, levels, colorbar, ax, name, log=False)
     ax = drawing.axes(ax, 1)
     lines, heights = [], []
     for part, side in _regions(sol.cloud):
@@ -158,13 +160,13 @@ def solution(sol: Solution, *, field: int = 0, exact: Any = None, at: Mapping[st
         heights.append(np.reshape(anywhere(lines[-1].reshape(-1, 1), **side), lines[-1].shape))
     line, height = np.concatenate(lines), np.concatenate(heights)
     # One NaN after every piece: where the domain has a gap the curve has one.
-    ax.plot(drawing.gapped(line), drawing.gapped(height), color=COLOURS[0], label=label)
+    ax.plot(drawing.gapped(line), drawing.gapped(height), color=COLOURS[0], label=name)
     ax.plot(np.asarray(sol.cloud.points)[:, 0], numbers, "o", color=COLOURS[0], markersize=4)
     if exact is not None:
         truth = drawing.at_points(exact, line.reshape(-1, 1)).reshape(line.shape)
         ax.plot(drawing.gapped(line), drawing.gapped(truth), "--", color="k", linewidth=1, label="exact")
         ax.legend(frameon=False)
-    drawing.labels(ax, "x", label)
+    drawing.labels(ax, "x", name)
     return ax
 
 
@@ -177,16 +179,16 @@ def fields(sol: Solution, *, names: Sequence[str] | None = None, ax: Any = None,
     sol : Solution
         Of a system.
     names : sequence of str, optional
-        One for every field, written above; ``u[0]``, ``u[1]``, ... if not given.
+        One for every field, with its unit; ``u[0]``, ``u[1]``, ... if not given.
     ax : array of Axes, optional
         As many as there are panels.
     **options : optional
-        As in ``js.plot.solution``.
+        As in ``js.plot.solution``; in 3D ``cut`` and ``engine`` as in ``js.plot.solid``, which then draws the fields.
 
     Returns
     -------
-    array of Axes
-        One a field; in 3D a row of slices for each.
+    array of Axes or pyvista.Plotter
+        One a field; in 3D a row of slices for each, or with ``cut`` or ``engine`` a solid.
 
     Raises
     ------
@@ -205,6 +207,8 @@ def fields(sol: Solution, *, names: Sequence[str] | None = None, ax: Any = None,
     _of(sol).refuse_stacked()
     count = 1 if np.ndim(sol.u) == 1 else sol.u.shape[1]
     titles = names_of(names, count)
+    if sol.cloud.dim == 3 and ("cut" in options or "engine" in options):
+        return solids(sol, titles, ax=ax, **options)
     if sol.cloud.dim == 3:
         slices = 3 if options.get("at") is None else len(options["at"])
         axes = drawing.rows_of(ax, count, slices, (3.6, 3.4))
@@ -212,7 +216,7 @@ def fields(sol: Solution, *, names: Sequence[str] | None = None, ax: Any = None,
         width, height = drawing.page(np.asarray(sol.cloud.points)) if sol.cloud.dim == 2 else (4.6, 3.4)
         axes = drawing.panels(ax, count, (width, height))
     for k, (one, title) in enumerate(zip(axes, titles)):
-        solution(sol, field=k, ax=one, **options)
+        solution(sol, field=k, ax=one, label=title, **options)
         if sol.cloud.dim < 3:
             one.set_title(title, fontsize="medium")
         else:
