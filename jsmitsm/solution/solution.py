@@ -35,7 +35,6 @@ class Report(Protocol):
 class Solution(Anywhere):
     """A solution at the particles, and anywhere through local Taylor polynomials.
 
-
     ``sol(points)`` evaluates it at points (M, D), ``sol.grad(points)`` its gradient.
 
     A solution is a pytree: it passes through ``jax.jit``, ``jax.grad`` and ``pickle``.
