@@ -19,13 +19,13 @@ from typing import Any, Literal, TypeAlias, get_args
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
 from jsmitsm.linear.factor_cache import Settings, clear_cache, factorisations, lookup
 from jsmitsm.linear.solver_choice import DENSE_MAX, refuse_too_large
 from jsmitsm.linear.sparse import Factor
 from jsmitsm.runtime.errors import SingularMatrix, SolveError
+from jsmitsm.runtime.jaxprs import Primitive
 from jsmitsm.runtime.tracers import is_traced
 
 __all__ = [

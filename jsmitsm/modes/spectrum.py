@@ -18,11 +18,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
 from jsmitsm.linear import linsolve
 from jsmitsm.runtime.errors import SingularMatrix, SolveError
+from jsmitsm.runtime.jaxprs import Primitive
 
 # Up to so many unknowns, or where so large a part of all values is wanted, the matrix is dense.
 _DENSE, _PART = 200, 0.25

@@ -22,12 +22,12 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import Literal, Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
 
 from jsmitsm.runtime import one_kernel
 from jsmitsm.runtime.collector import uncollected
 from jsmitsm.runtime.compiler_options import on_cpu
+from jsmitsm.runtime.jaxprs import Literal, Primitive, jaxpr_as_fun
 from jsmitsm.runtime.size_classes import BLOCK
 from jsmitsm.runtime.threads import cores, side_by_side
 from jsmitsm.runtime.tracers import is_traced, recorded
