@@ -9,8 +9,8 @@ import matplotlib
 from benchmarks.commandline import arguments
 
 EXAMPLES = sorted((Path(__file__).parent.parent / "docs" / "gallery").glob("*.py"))
-# Dear to compile, and numbers like theirs are held elsewhere among the tests: the workflow of the site runs them (all of
-# the gallery), the tests do not.
+# Dear to compile, and numbers like theirs are held elsewhere among the tests, which leave them out: the workflow of the
+# site runs the whole gallery.
 SLOW = {"cavity", "colloid", "composite", "inverse", "island", "kirsch", "kovasznay", "torus"}
 
 
