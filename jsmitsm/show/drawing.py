@@ -308,7 +308,7 @@ def page(points: np.ndarray) -> tuple[float, float]:
     if points.shape[1] != 2:
         return (5.6, 1.6) if points.shape[1] == 1 else (7.6, 5.0)
     width, height = np.ptp(points, axis=0)
-    ratio = float(np.clip(height / width, 0.3, 2.2)) if width > 0 else 1.0 if height == 0 else 2.2
+    ratio = float(np.clip(height / width, 0.4, 2.2)) if width > 0 else 1.0 if height == 0 else 2.2
     wide = 4.6 if ratio < 1 else 4.6 / ratio
     return wide + 1.3, wide * ratio + 0.5
 
