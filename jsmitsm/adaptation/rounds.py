@@ -272,8 +272,9 @@ class Rounds:
             except ValueError as refusal:
                 if "cells" not in str(refusal) and "too coarse" not in str(refusal):
                     raise
-                field = SpacingField(points, np.maximum(field.spacing, 4.0 * field.spacing.min()), spacing.largest) if (
-                    "cells" in str(refusal)) else field.scaled(0.7)  # fmt: skip
+                coarser = np.maximum(field.spacing, 4.0 * field.spacing.min())
+                few = "cells" in str(refusal)
+                field = SpacingField(field.points, coarser, field.largest) if few else field.scaled(0.7)
                 continue
             if len(following) > self.max_particles:
                 field = field.scaled((1.1 * len(following) / self.max_particles) ** (1.0 / cloud.dim))
