@@ -117,6 +117,7 @@ class Problem:
         """The point sources."""
         return () if self.extras is None else self.extras.sources
 
+    @explaining
     def replace(self, **changes: Any) -> Problem:
         """The same problem with other parts.
 
