@@ -10,6 +10,7 @@ import jax.numpy as jnp
 
 from jsmitsm.equation.bcs import Condition
 from jsmitsm.equation.problem import Problem, of_parts
+from jsmitsm.equation.regions.per_region import PerRegion
 
 
 def stated(problem: Problem, unknowns: Any) -> Problem:
@@ -18,15 +19,25 @@ def stated(problem: Problem, unknowns: Any) -> Problem:
     if not problem.extras.unknowns:  # constraints alone: its functions are called as ever
         return Problem(problem.pde, problem.bcs, problem.fields, problem.params)
     given = problem.params is not None
+    pde: Any = problem.pde
+    if isinstance(pde, PerRegion):
+        pde = {name: _pde(one, given, f"pde[{name!r}]") for name, one in pde.items()}
+    else:
+        pde = _pde(pde, given, "pde")
+    bcs = {name: [_condition(c, given) for c in cs] for name, cs in problem.bcs.items()}
+    return Problem(pde, bcs, problem.fields, (problem.params, floats(unknowns)))
+
+
+def _pde(pde: Callable[..., Any], given: bool, name: str) -> Callable[..., Any]:
+    """A user's equation as one of (u, x, pair). ValueError where it cannot be called so."""
     try:
-        inspect.signature(problem.pde).bind(*[None] * (4 if given else 3))
+        inspect.signature(pde).bind(*[None] * (4 if given else 3))
     except TypeError as error:
         called = "pde(u, x, params, unknowns)" if given else "pde(u, x, unknowns)"
-        raise ValueError(f"pde: {error}; with unknowns it is called as {called}, all other functions alike") from None
+        raise ValueError(f"{name}: {error}; with unknowns it is called as {called}, all other functions alike") from None
     except ValueError:  # a callable without a signature
         pass
-    bcs = {name: [_condition(c, given) for c in cs] for name, cs in problem.bcs.items()}
-    return Problem(_function(problem.pde, given), bcs, problem.fields, (problem.params, floats(unknowns)))
+    return _function(pde, given)
 
 
 def at(plain: Problem, unknowns: Any) -> Problem:

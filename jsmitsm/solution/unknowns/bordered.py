@@ -19,15 +19,23 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from jsmitsm.discretization.layout import Discretization
+from jsmitsm.discretization.coefficients import Numbers, numbers
+from jsmitsm.discretization.layout import Discretization, table
+from jsmitsm.discretization.least_squares import least_squares_right_side
+from jsmitsm.discretization.leave_one_out import right_side
 from jsmitsm.discretization.periodic import with_corners
+from jsmitsm.discretization.regions.layout import Regions, discretize_regions
+from jsmitsm.discretization.regions.rows import RegionNumbers, region_numbers, whole_right_side, whole_table
 from jsmitsm.equation.conditions import group_conditions
 from jsmitsm.equation.unknowns.stated import at
 from jsmitsm.runtime.tracers import is_traced
+from jsmitsm.solution.fit import Fit, Recipe
+from jsmitsm.solution.regions.fit import RegionsFit
+from jsmitsm.solution.regions.run import RegionsRun
 from jsmitsm.solution.run import Run
 
 
-class BorderedRun(Run):
+class Bordered(Run):
     """A linear solve with rows and columns more: ``columns`` (n, K), ``lines`` (K, n), ``corner`` (K, K)."""
 
     def __init__(self, *args: Any):
@@ -37,7 +45,7 @@ class BorderedRun(Run):
         self.corner: Any = np.zeros((0, 0))
         self.right: Any = np.zeros(0)
         self.system: tuple[Any, Any, Any] = (np.zeros(0), np.zeros(0, int), np.zeros(0, int))  # entries and places
-        self.parts: list[Any] = []  # of the least-squares form
+        self.squares: list[Any] = []  # parts of the least-squares form
         self.multipliers = False  # whether the columns are those of free constants
 
     @property
@@ -48,11 +56,25 @@ class BorderedRun(Run):
     def bordering(self) -> int:
         return len(self.corner)
 
-    def moved(self, unknowns: dict[str, Any]) -> Discretization:
+    def moved(self, unknowns: dict[str, Any]) -> Any:
         """The discretisation of the problem with other unknowns."""
-        problem, disc = at(self.problem, unknowns), self.disc
-        groups = group_conditions(problem, with_corners(problem, disc.cloud), disc.rec.order, disc.traced.order)
-        return replace(disc, problem=problem, groups=groups)
+        raise NotImplementedError
+
+    def numbers_of(self, disc: Any) -> Any:
+        """The numbers of one of these."""
+        raise NotImplementedError
+
+    def right_of(self, nums: Any) -> Any:
+        """The right-hand side (n,) that belongs to the rows of the last step."""
+        raise NotImplementedError
+
+    def operators_of(self, nums: Any) -> list[Any]:
+        """All numbers that the matrix is made of."""
+        raise NotImplementedError
+
+    def fit(self, unknowns: dict[str, Any], recipe: Recipe) -> Any:
+        """What fits the local polynomials of values that belong to these unknowns."""
+        raise NotImplementedError
 
     def constants(self) -> np.ndarray:
         """Columns of ones (n, K) for the fields that are free up to a constant."""
@@ -83,3 +105,50 @@ class BorderedRun(Run):
     def check_balance(self, taylor: Any = None) -> None:
         super().check_balance(taylor)
         self.messages = [m for m in self.messages if "its mean over the particles is 0" not in m]
+
+
+class BorderedRun(Bordered):
+    """In one region."""
+
+    def moved(self, unknowns: dict[str, Any]) -> Discretization:
+        problem, disc = at(self.problem, unknowns), self.disc
+        groups = group_conditions(problem, with_corners(problem, disc.cloud), disc.rec.order, disc.traced.order)
+        return replace(disc, problem=problem, groups=groups)
+
+    def numbers_of(self, disc: Discretization) -> Numbers:
+        return numbers(disc, disc.problem)
+
+    def right_of(self, nums: Numbers) -> Any:
+        if self.formulation == "lsq":
+            return least_squares_right_side(self.disc, nums, self.squares)
+        assert self.rows is not None
+        return right_side(self.disc, nums, *self.rows)
+
+    def operators_of(self, nums: Numbers) -> list[Any]:
+        return [nums.jac, nums.own, nums.data]
+
+    def fit(self, unknowns: dict[str, Any], recipe: Recipe) -> Fit:
+        disc = self.disc
+        return Fit(at(self.problem, unknowns), disc.cloud, disc.kernel, table(disc), None, recipe)
+
+
+class BorderedRegionsRun(Bordered, RegionsRun):
+    """In several regions."""
+
+    def moved(self, unknowns: dict[str, Any]) -> Regions:
+        disc = self.disc
+        problem, near = at(self.problem, unknowns), whole_table(disc)
+        return discretize_regions(problem, disc.cloud, disc.rec.order, disc.rec.depth, near, sources=False)
+
+    def numbers_of(self, disc: Regions) -> RegionNumbers:
+        return region_numbers(disc)
+
+    def right_of(self, nums: RegionNumbers) -> Any:
+        return whole_right_side(self.disc, nums, self.parts, self.bound)
+
+    def operators_of(self, nums: RegionNumbers) -> list[Any]:
+        each = [getattr(own, name) for own in nums.parts for name in ("jac", "own", "data")]
+        return [*each, *(coef for coef, _ in nums.between.values())]
+
+    def fit(self, unknowns: dict[str, Any], recipe: Recipe) -> RegionsFit:
+        return RegionsFit(at(self.problem, unknowns), self.disc.cloud, whole_table(self.disc), None, recipe)
