@@ -30,6 +30,7 @@ from jsmitsm.solution.solution import Solution
 from jsmitsm.solution.unknowns.bordered import BorderedRegionsRun, BorderedRun
 from jsmitsm.solution.unknowns.complex_solution import complex_solution
 from jsmitsm.solution.unknowns.constrained import solve_constrained
+from jsmitsm.solution.unknowns.integral import IntegralTerm
 from jsmitsm.solution.unknowns.point_solution import (
     PointSolution,
     RegionsPointSolution,
@@ -148,12 +149,12 @@ def solve(
 def prepared(
     problem: Problem, cloud: Cloud, *, method: str = "S", order: int = 4, kernel: Kernel | None = None,
     stencils: Stencils | None = None, basis_terms: int | None = None, formulation: str = "auto", solver: str = "auto",
-    u0: Any = None, throw: bool = True, depth: Depth = "auto", kind: type[Run] = Run,
+    u0: Any = None, throw: bool = True, depth: Depth = "auto", kind: type[Run] = Run, sources: bool = False,
 ) -> Run:  # fmt: skip
-    """Checked arguments of ``js.solve``, discretised; kind: of run that is made of them."""
+    """Checked arguments of ``js.solve``, discretised; kind: of run that is made of them, sources: see discretize."""
     start = time.perf_counter()
     check(problem, cloud, method, order, kernel, stencils, formulation, solver, u0, throw, depth)
-    disc = discretize(problem, cloud, method, order, kernel, stencils, basis_terms, sources=False, depth=depth)
+    disc = discretize(problem, cloud, method, order, kernel, stencils, basis_terms, sources=sources, depth=depth)
     problem = disc.problem
     run = kind(disc, problem, solver, throw, kernel is None and stencils is None, formulation)
     run.began, run.seconds["set-up"] = start, time.perf_counter() - start
@@ -197,12 +198,15 @@ def with_extras(problem: Problem, cloud: Cloud, *, order: Any, **options: Any) -
         check_inside(problem.extras.sources, cloud)
         regular, singular = regular_problem(problem, cloud)
         return PointSolution.of(solve(regular, cloud, order=order, **options), singular)
+    term = IntegralTerm(problem, cloud) if problem.extras.kernels else None
     plain = stated(problem, problem.extras.unknowns)
     run: Any
     if several:
-        run = prepared_regions(plain, cloud, order=order, kind=BorderedRegionsRun, **options)
+        run = prepared_regions(plain, cloud, order=order, kind=BorderedRegionsRun, sources=term is not None, **options)
     else:
-        run = prepared(plain, cloud, order=order, kind=BorderedRun, **options)
+        run = prepared(plain, cloud, order=order, kind=BorderedRun, sources=term is not None, **options)
+    if term is not None:
+        run.term, run.whole = term, stated(problem, problem.extras.unknowns, term.points)
 
     def again(order: int) -> Any:
         other = {"method": "S", "depth": run.disc.rec.depth, "solver": options["solver"]}

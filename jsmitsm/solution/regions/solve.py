@@ -21,7 +21,7 @@ from jsmitsm.solution.regions.solution import RegionsSolution
 def prepared_regions(
     problem: Any, cloud: Any, *, method: str = "S", order: int = 4, kernel: Any = None, stencils: Any = None,
     basis_terms: Any = None, formulation: str = "auto", solver: str = "auto", u0: Any = None, throw: bool = True,
-    depth: Any = 0, kind: type[RegionsRun] = RegionsRun,
+    depth: Any = 0, kind: type[RegionsRun] = RegionsRun, sources: bool = False,
 ) -> RegionsRun:  # fmt: skip
     """Checked arguments of a solve, discretised; kind: of run that is made of them."""
     start = time.perf_counter()
@@ -41,7 +41,7 @@ def prepared_regions(
             "stencils: the points are traced by a JAX transform, and neighbours are found on the host; build "
             "stencils = js.stencils(cloud, size=...) before the transform and pass stencils=stencils to solve"
         )
-    disc = discretize_regions(problem, cloud, order, depth, near, sources=False)
+    disc = discretize_regions(problem, cloud, order, depth, near, sources=sources)
     run = kind(disc, solver, throw, near is None)
     run.began, run.seconds["set-up"] = start, time.perf_counter() - start
     if disc.held.all():

@@ -13,7 +13,7 @@ import numpy as np
 
 from jsmitsm.discretization.leave_one_out import with_held
 from jsmitsm.equation.problem import Problem
-from jsmitsm.equation.unknowns.stated import at, floats
+from jsmitsm.equation.unknowns.stated import floats
 from jsmitsm.runtime.errors import IN_FUNCTIONS, in_words
 from jsmitsm.runtime.progress import bar
 from jsmitsm.runtime.tracers import concrete, is_traced
@@ -84,14 +84,20 @@ def solve_constrained(
     constraints, start = problem.extras.constraints, floats(problem.extras.unknowns)
     _check(problem, run)
     disc, names, several = run.disc, list(start), isinstance(run, BorderedRegionsRun)
-    run.multipliers = not names
+    if run.term is not None:
+        run.term.weigh(disc.cloud, recipe.order)
+        run.solver = "dense" if run.solver == "auto" else run.solver
+    run.multipliers = not names and run.term is None
     answer = _response(run, start)
     recipe = replace(recipe, formulation=run.formulation)
+    if not constraints:
+        x, good = _solved(run, answer)
+        return _finished(run, answer, start, start, with_held(disc, answer.nums, x), good, 1, recipe, again)
 
     def missed(values: Any, unknowns: Any) -> Any:
         """By how much the constraints (K,) are missed."""
         made = RegionsProbe if several else Probe
-        probe = made(values, disc.cloud, recipe, run.fit(unknowns, recipe), True, 1, {}, unknowns=unknowns)
+        probe = made(values, disc.cloud, recipe, run.fit(unknowns, values, recipe), True, 1, {}, unknowns=unknowns)
         return jnp.stack([_value(c, probe, k) for k, c in enumerate(constraints)])
 
     run.columns = run.constants() if run.multipliers else -answer.columns
@@ -130,19 +136,22 @@ def solve_constrained(
 def _finished(run, answer, start, unknowns, values, good, steps, recipe, again) -> WithUnknowns:
     """Judge what came out, and hand it on."""
     disc, names = run.disc, list(start)
-    problem = at(run.problem, unknowns)
-    traced = is_traced(values, unknowns)
+    traced, plain = is_traced(values, unknowns), run.fit(unknowns, values, recipe)
     if not traced:
-        values, run.disc, run.problem = np.asarray(values), run.moved(unknowns), problem
-        run.nums, run.values = run.numbers(), values
+        values = np.asarray(values)
         if names:
             _refuse_nonlinear(run, answer, start, unknowns)
+        run.disc = run.moved(unknowns, values)
+        run.problem = run.disc.problem
+        run.nums, run.values = run.numbers(), values
+        told = run.term and run.term.coarse()
+        if told:
+            run.object(told)
         if not bool(good) and not run.failed and np.isfinite(values).all():
             run.fail(f"the constraints are not met after {steps} step(s) of Newton's method; are they possible?")
         good = bool(good) and not run.failed and bool(np.isfinite(values).all())
     run.seconds["total"] = time.perf_counter() - run.began
     several, stats = isinstance(run, BorderedRegionsRun), run.stats()
-    plain = run.fit(unknowns, recipe)
     own = (ComparedRegionsFit if several else ComparedFit)(*plain.tree_flatten()[0], recipe)
     own.again = None if traced else again
     return (ConstrainedRegionsSolution if several else ConstrainedSolution)(
@@ -155,6 +164,13 @@ def _check(problem: Problem, run: Bordered) -> None:
     assert problem.extras is not None
     constraints, unknowns = problem.extras.constraints, problem.extras.unknowns
     floating = run.disc.floating
+    if not run.disc.linear and problem.extras.kernels:
+        raise ValueError(
+            "integral: the problem is nonlinear in u, and integral terms are made for linear ones; linearise it, and "
+            "repeat the solve with what it gave (a Picard iteration)"
+        )
+    if problem.extras.kernels and run.disc.scheme.method != "S":
+        raise ValueError(f'method: {run.disc.scheme.method} is not made for integral terms; use "S"')
     if not run.disc.linear:
         raise ValueError(
             "constraints: the problem is nonlinear in u, and constraints are made for linear ones; solve it for given "
@@ -162,7 +178,7 @@ def _check(problem: Problem, run: Bordered) -> None:
         )
     if run.disc.scheme.method in ("I", "II"):
         raise ValueError(f'method: {run.disc.scheme.method} is not made for constraints; use "S", "III" or "SSPH"')
-    wanted = len(unknowns) or len(floating)
+    wanted = len(unknowns) or (0 if problem.extras.kernels else len(floating))
     if len(constraints) != wanted:
         named = f" ({', '.join(unknowns)})" if unknowns else ""
         constant = f"; nothing else fixes the constant of {len(floating)} field(s), which take one each"
@@ -204,9 +220,9 @@ def _refuse_in_operator(one: list[Any], two: list[Any], name: str) -> None:
 def _refuse_nonlinear(run: Bordered, answer: Response, start: Any, unknowns: Any) -> None:
     """The unknowns must have entered as they were taken to."""
     away = np.array([float(unknowns[n] - start[n]) for n in start])
-    assert run.nums is not None
-    found = (answer.right, answer.columns @ away, run.right_of(run.nums)), (
-        answer.nums.held, np.tensordot(away, answer.held, axes=1), run.nums.held
+    nums = run.numbers_of(run.moved(unknowns))
+    found = (answer.right, answer.columns @ away, run.right_of(nums)), (
+        answer.nums.held, np.tensordot(away, answer.held, axes=1), nums.held
     )  # fmt: skip
     for first, moved, there in found:
         size = max(np.abs(part).max(initial=0.0) for part in (first, moved, there))
