@@ -88,14 +88,10 @@ def test_an_integral_over_several_regions():
     between = js.interface(flux, jump=half - 1.125, source=half - 2.25)
     kernel = lambda x, y: 1.0 + x[0] * y[0]  # noqa: E731
     truth = np.concatenate([jax.vmap(exact[n])(cloud.points[ids]) for n, ids in cloud.regions.items()])
+    rest = {n: lambda u, x, n=n: k[n] * (js.laplacian(u)(x) - js.laplacian(exact[n])(x)) for n in k}
+    whole = {n: lambda u, x, n=n: rest[n](u, x) - (moments[0] + x[0] * moments[1]) for n in k}
     for given in (kernel, {"b": kernel}):
-
-        def pde(u, x, n):
-            rest = k[n] * (js.laplacian(u)(x) - js.laplacian(exact[n])(x))
-            return rest - (moments[0] + x[0] * moments[1]) if n in given_in else rest
-
-        given_in = given if isinstance(given, dict) else k
-        pdes = {n: lambda u, x, n=n, pde=pde: pde(u, x, n) for n in k}
+        pdes = whole if given is kernel else {"a": rest["a"], "b": whole["b"]}
         sol = js.solve(js.Problem(pdes, {"boundary": ends, "a|b": between}, integral=given), cloud)
         assert np.abs(sol.u - truth).max() < 1e-9 and sol.flags == []
         assert abs(sol([[0.5]], region="b")[0] - 1.125) < 1e-9
@@ -118,9 +114,8 @@ def test_what_does_not_work_is_said():
     refused("expected a function kernel", integral=3.0)
     refused("the problem has no regions", integral={"a": wave})
     with pytest.raises(ValueError, match="the points are traced"):
-        near = js.stencils(ROD, size=5)
-        moved = lambda s: js.solve(js.Problem(pde, ENDS, integral=wave), ROD.replace(points=s * ROD.points), stencils=near)
-        jax.grad(lambda s: moved(s).u[3])(1.0)
+        problem, near = js.Problem(pde, ENDS, integral=wave), js.stencils(ROD, size=5)
+        jax.grad(lambda s: js.solve(problem, ROD.replace(points=s * ROD.points), stencils=near).u[3])(1.0)
     for ask in (lambda p: js.factorize(p, ROD), lambda p: js.eigen(p, ROD, 2)):
         with pytest.raises(ValueError, match="integral terms are for js.solve alone"):
             ask(js.Problem(pde, ENDS, integral=wave))

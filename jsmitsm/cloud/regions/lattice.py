@@ -164,7 +164,7 @@ def _cloud(
 
 
 def _labelled(points: np.ndarray, facets: dict[tuple[int, int], _Facet], groups: Any) -> Callable[..., np.ndarray]:
-    """The function that gives points of the boundary their groups; whatever is wrong with these is said of the nodes."""
+    """The function that gives points of the boundary their groups; what is wrong with these is said of the nodes."""
     if groups is None:
         return lambda at: np.full(len(at), "boundary", object)
     outer = [facet.corners.ravel() for (_, other), facet in facets.items() if other < 0]
@@ -184,7 +184,7 @@ def _unit(way: np.ndarray, at: np.ndarray) -> np.ndarray:
     bad = np.flatnonzero(size[:, 0] == 0)
     if len(bad):
         raise ValueError(
-            f"shapes: two regions touch in a point alone, {at[bad[0]]}, where no direction leads from one to the other; "
+            f"shapes: two regions touch in a point alone, {at[bad[0]]}, where no way leads from one to the other; "
             "let the predicates part them along whole sides of cells"
         )
     return way / size

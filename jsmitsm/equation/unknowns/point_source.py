@@ -7,8 +7,8 @@ With r = |x - x0| and m = c / a the operator a laplacian(u) + c u has the fundam
     3D   -sum_j (-m r^2)^j / (2 j)! / (4 pi a r),
 
 which are |x|/2, log r and 1/r for Laplace (m = 0), and regular solutions away from Y0, K0, cos(k r)/r and cosh(k r)/r
-for Helmholtz (m > 0) and screened (m < 0) operators. The D displacements under a laplacian(u) + b grad(div u), elasticity
-with a = mu and b = lambda + mu (plane strain), answer to a force F by Kelvin's solution,
+for Helmholtz (m > 0) and screened (m < 0) operators. The D displacements under a laplacian(u) + b grad(div u),
+elasticity with a = mu and b = lambda + mu (plane strain), answer to a force F by Kelvin's solution,
 
     (F Phi - b / (a + b) grad grad Psi F) / a,        laplacian Phi = delta,  laplacian Psi = Phi,
 

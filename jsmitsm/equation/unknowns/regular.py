@@ -31,8 +31,9 @@ def regular_problem(problem: Problem, cloud: Cloud) -> tuple[Problem, Singular |
     """The problem of the regular part w of u = w + singular part, and that part."""
     assert problem.extras is not None
     singular = _singular(problem, problem.pde, cloud, list(enumerate(problem.extras.sources)))
+    parts = [(singular, np.arange(len(cloud)))]
     bcs = {
-        name: [_regular(problem, condition, cloud, name, [(singular, np.arange(len(cloud)))]) for condition in conditions]
+        name: [_regular(problem, condition, cloud, name, parts) for condition in conditions]
         for name, conditions in problem.bcs.items()
     }
     return Problem(problem.pde, bcs, problem.fields, problem.params), singular

@@ -42,7 +42,8 @@ def stated(problem: Problem, unknowns: Any, points: Any = None) -> Problem:
 
     pde = {n: made(one, n) for n, one in pde.items()} if isinstance(pde, PerRegion) else made(pde, None)
     bcs = {name: [_condition(c, given, named) for c in cs] for name, cs in problem.bcs.items()}
-    return Problem(pde, bcs, fields, (problem.params, floats(unknowns), np.zeros((len(points) if kernels else 0, fields))))
+    carried = np.zeros((len(points) if kernels else 0, fields))
+    return Problem(pde, bcs, fields, (problem.params, floats(unknowns), carried))
 
 
 def _pde(pde: Callable[..., Any], given: bool, named: bool, name: str) -> Callable[..., Any]:
