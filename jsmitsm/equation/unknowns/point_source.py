@@ -101,10 +101,9 @@ def point_source(x0: ArrayLike, strength: ArrayLike = 1.0) -> PointSource:
 
 
 def _checked_strength(strength: Any) -> Any:
-    if is_traced(strength) or np.ndim(strength) != 1:
-        if is_traced(strength) and np.ndim(strength) == 1:
-            return strength
-        return checked_number(strength, "strength")
+    """A finite number, or a vector of them; traced ones pass."""
+    if np.ndim(strength) != 1 or is_traced(strength):
+        return strength if np.ndim(strength) == 1 else checked_number(strength, "strength")
     return np.array([checked_number(s, f"strength[{k}]") for k, s in enumerate(strength)], float)
 
 
@@ -115,6 +114,7 @@ class Singular(NamedTuple):
     strengths: Any
     a: Any
     m: Any
+    sound: Any = True  # under a JAX transform that hides the coefficients, whether they are those of the operator
 
     def at(self, x: Any) -> Any:
         """At one point (D,)."""
@@ -128,6 +128,7 @@ class Kelvin(NamedTuple):
     strengths: Any
     a: Any
     b: Any
+    sound: Any = True
 
     @property
     def m(self) -> float:

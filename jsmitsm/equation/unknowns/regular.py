@@ -75,8 +75,8 @@ def _singular(problem: Problem, pde: Any, cloud: Cloud, sources: list[tuple[int,
     places, strengths = (jnp.stack([jnp.asarray(s[k], float) for _, s in sources]) for k in (0, 1))
     singular: Singular | Kelvin
     if problem.fields == 1:
-        a, c = _operator(problem, pde, cloud)
-        singular = Singular(places, strengths, a, c / a)
+        a, c, sound = _operator(problem, pde, cloud)
+        singular = Singular(places, strengths, a, c / a, sound)
     else:
         singular = Kelvin(places, strengths, *_elasticity(problem, pde, cloud))
     _check_distances(singular, cloud)
@@ -94,7 +94,7 @@ def _coefficients(problem: Problem, pde: Any, cloud: Cloud) -> tuple[Any, Any]:
     return record, record.coefficients(cloud.points[:1], 0, params=problem.params)[0][:, :, 0, 0]
 
 
-def _elasticity(problem: Problem, pde: Any, cloud: Cloud) -> tuple[Any, Any]:
+def _elasticity(problem: Problem, pde: Any, cloud: Cloud) -> tuple[Any, Any, Any]:
     """The constants of a laplacian(u) + b grad(div u) of D displacements; ValueError for any other operator."""
     dim, fields = cloud.dim, problem.fields
     if fields != dim or dim == 1:
@@ -109,38 +109,44 @@ def _elasticity(problem: Problem, pde: Any, cloud: Cloud) -> tuple[Any, Any]:
     twice = [tuple(2 * int(i == k) for i in range(dim)) for k in range(dim)]
     both = [[tuple(int(i in (e, f)) for i in range(dim)) for f in range(dim)] for e in range(dim)]
     a, b = found(0, 0, twice[1]), found(0, 1, both[0][1])
-    size = max([abs(float(v)) for v in map(concrete, map(jnp.asarray, (a, b))) if v is not None], default=0.0)
     terms = {(f, index) for f, index in record.slots} | {(f, i) for f in range(dim) for i in multi_indices(dim, 2)}
+    off = []
     for e in range(dim):
         for f, index in terms:
             if e == f and index in twice:
                 wanted = a + b if index == twice[e] else a
             else:
                 wanted = b if e != f and index == both[e][f] else 0.0
-            off = concrete(jnp.asarray(found(e, f, index) - wanted))
-            if off is not None and abs(float(off)) > ROUND_OFF * size:
-                raise _unknown("a system of other terms than those of elasticity", cloud)
-    known = [concrete(jnp.asarray(v)) for v in (a, a + b)]
-    if any(v is not None and float(v) == 0.0 for v in known):
+            off.append(found(e, f, index) - wanted)
+    sound = _true(jnp.max(jnp.abs(jnp.stack(off))) <= ROUND_OFF * jnp.maximum(jnp.abs(a), jnp.abs(b)))
+    if sound is False:
+        raise _unknown("a system of other terms than those of elasticity", cloud)
+    if _true((a == 0.0) | (a + b == 0.0)) is True:
         raise _unknown("a system without a term of elasticity", cloud)
-    return a, b
+    return a, b, sound
 
 
-def _operator(problem: Problem, pde: Any, cloud: Cloud) -> tuple[Any, Any]:
+def _true(value: Any) -> Any:
+    """A truth value of JAX as one of Python where it is known."""
+    known = concrete(jnp.asarray(value))
+    return value if known is None else bool(known)
+
+
+def _operator(problem: Problem, pde: Any, cloud: Cloud) -> tuple[Any, Any, Any]:
     """The constants of a laplacian(u) + c u; ValueError for any other operator."""
     record, jac = _coefficients(problem, pde, cloud)
     found = {b: jac[0, s] for s, (_, b) in enumerate(record.slots)}
     zero = (0,) * cloud.dim
     second = [tuple(2 * int(i == k) for i in range(cloud.dim)) for k in range(cloud.dim)]
     c, leading = found.pop(zero, 0.0), [found.pop(b, 0.0) for b in second]
-    known, rest = [concrete(v) for v in leading], [concrete(v) for v in found.values()]
-    for v in rest:
+    for v in map(concrete, found.values()):
         if v is None or float(v) != 0.0:
             raise _unknown("an operator with first, mixed or higher derivatives", cloud)
-    sizes = None if any(v is None for v in known) else np.asarray(known, float)
-    if sizes is not None and (sizes[0] == 0.0 or np.ptp(sizes) > ROUND_OFF * abs(sizes[0])):
+    sizes = jnp.stack([jnp.asarray(v, float) for v in leading])
+    sound = _true((sizes[0] != 0.0) & (jnp.ptp(sizes) <= ROUND_OFF * jnp.abs(sizes[0])))
+    if sound is False:
         raise _unknown("an operator that is not the same in all directions", cloud)
-    return leading[0], c
+    return leading[0], c, sound
 
 
 def _unknown(what: str, cloud: Cloud) -> ValueError:
@@ -223,9 +229,8 @@ def _regular(
 
     def of_singular(function: Callable[..., Any], *more: Any) -> Any:
         made = [jax.vmap(lambda *a, s=s: function(s, *a))(points, *more) for s, _ in touched]
-        found = sum(
-            jnp.where(here.reshape(-1, *[1] * several), one, 0.0) for one, (_, here) in zip(made, touched)
-        )  # fmt: skip
+        kept = [jnp.where(here.reshape(-1, *[1] * several), one, 0.0) for one, (_, here) in zip(made, touched)]
+        found = jnp.sum(jnp.stack(kept), axis=0)
         return found if c.field is None or not several else found[:, c.field]
 
     there = of_singular(lambda singular, x: singular.at(x))

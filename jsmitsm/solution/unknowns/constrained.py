@@ -96,7 +96,7 @@ def solve_constrained(
 
     def missed(values: Any, unknowns: Any) -> Any:
         """By how much the constraints (K,) are missed."""
-        made = RegionsProbe if several else Probe
+        made: Any = RegionsProbe if several else Probe
         probe = made(values, disc.cloud, recipe, run.fit(unknowns, values, recipe), True, 1, {}, unknowns=unknowns)
         return jnp.stack([_value(c, probe, k) for k, c in enumerate(constraints)])
 
@@ -152,7 +152,8 @@ def _finished(run, answer, start, unknowns, values, good, steps, recipe, again) 
         good = bool(good) and not run.failed and bool(np.isfinite(values).all())
     run.seconds["total"] = time.perf_counter() - run.began
     several, stats = isinstance(run, BorderedRegionsRun), run.stats()
-    own = (ComparedRegionsFit if several else ComparedFit)(*plain.tree_flatten()[0], recipe)
+    kind: Any = ComparedRegionsFit if several else ComparedFit
+    own = kind(*plain.tree_flatten()[0], recipe)
     own.again = None if traced else again
     return (ConstrainedRegionsSolution if several else ConstrainedSolution)(
         values, disc.cloud, recipe, own, good, steps, stats, report=None if traced else run, unknowns=unknowns
@@ -242,7 +243,7 @@ def _solved(run: Bordered, answer: Response) -> tuple[Any, Any]:
     return x, bool(good) and bool(np.isfinite(x).all())
 
 
-def _value(c: Any, probe: Probe, k: int) -> Any:
+def _value(c: Any, probe: Any, k: int) -> Any:
     try:
         found = jnp.asarray(c.functional(probe))
     except IN_FUNCTIONS as error:

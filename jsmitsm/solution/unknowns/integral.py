@@ -8,13 +8,14 @@ of the source kernel(x, y_j). That is dense.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jsmitsm.cloud.quadrature import quadrature
+from jsmitsm.cloud.quadrature import Quadrature, quadrature
 from jsmitsm.cloud.regions.node_weights import node_weights
 from jsmitsm.equation.problem import Problem
 from jsmitsm.equation.unknowns.integral import recorded_kernel
@@ -32,6 +33,10 @@ _MORE = {1: 2, 2: 2, 3: 0}
 _FEW = 400
 
 Sources = Callable[[Callable[[str | None, Any, Recursion], Any]], Any]
+
+
+def _nothing(_: str | None, points: Any, rec: Recursion) -> np.ndarray:
+    return np.zeros((rec.n_rows, 1))
 
 
 def known_points(cloud: Any) -> np.ndarray:
@@ -62,7 +67,7 @@ class IntegralTerm:
         if not is_traced(self.params):
             for name in self.records:  # where x and y meet
                 self._finite(name, self.points, 2, self.points)
-        self.weights, self.finer = np.zeros(0), None
+        self.weights, self.finer = np.zeros(0), Quadrature(*(np.zeros(0),) * 3)
         self.block: Any = np.zeros((0, 0))  # what the matrix gets, (n, n), once assembled
         self._known: Any = np.zeros((0, 0))  # what stands before the held values, (n, N F)
 
@@ -86,14 +91,13 @@ class IntegralTerm:
         (rows, n) a function of a region's name, its points and recursion gives. number (N, F): of every value the
         unknown it is, -1 where it is held.
         """
-        fields, none = self.fields, right_of(sources(lambda _, points, rec: np.zeros((rec.n_rows, 1))))
+        fields, none = self.fields, right_of(sources(_nothing))
 
         def column(y: Any) -> Any:
             """Of one y the rows (F, n)."""
             made = []
             for g in range(fields):
-                nums = sources(lambda name, points, rec, g=g: self._series(name, points, rec, y, g))
-                made.append(right_of(nums) - none)
+                made.append(right_of(sources(partial(self._series, y=y, g=g))) - none)
             return (jnp if is_traced(made) else np).stack(made)
 
         if is_traced(self.params, none, [r._record.consts for r in self.records.values()]):
@@ -111,8 +115,8 @@ class IntegralTerm:
         self._known = (rows * (known < 0)[:, None]).T
         if not is_traced(rows):
             block = np.zeros((n, n))
-            np.subtract.at(block, (slice(None), known[free]), rows[free].T)
-            self.block = block
+            np.subtract.at(block, known[free], rows[free])  # type: ignore[arg-type]
+            self.block = block.T
         else:
             self.block = jnp.zeros((n, n)).at[:, known[free]].add(-rows[free].T)
 

@@ -36,6 +36,7 @@ class PointSolution(Solution):
         new = object.__new__(cls)
         new.__dict__.update(regular.__dict__)
         new.regular, new.singular = regular, singular
+        new.converged = _sound(regular, [singular])
         return new
 
     @property
@@ -83,6 +84,7 @@ class RegionsPointSolution(RegionsSolution):
         new = object.__new__(cls)
         new.__dict__.update({k: v for k, v in regular.__dict__.items() if k != "_regions"})
         new.regular, new.singular = regular, singular
+        new.converged = _sound(regular, list(singular.values()))
         return new
 
     @property
@@ -116,6 +118,14 @@ class RegionsPointSolution(RegionsSolution):
     @classmethod
     def tree_unflatten(cls, _, leaves):
         return cls.of(*leaves) if isinstance(leaves[0], Solution) else _placeholder(cls, leaves)
+
+
+def _sound(regular: Solution, parts: list[Singular | Kelvin]) -> Any:
+    """Whether the solve went well, and the singular parts are those of the operators."""
+    out = regular.converged
+    for part in parts:
+        out = out if part.sound is True else jnp.logical_and(out, part.sound)
+    return out
 
 
 def _placeholder(cls: type, leaves: Any) -> Any:
