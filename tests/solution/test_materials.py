@@ -374,3 +374,13 @@ def test_a_point_source_in_one_of_two_media():
         js.solve(js.Problem(pde, both, sources=[js.point_source(place, s)]), cloud)
     with pytest.raises(ValueError, match="outside of the domain"):
         js.solve(js.Problem(pde, both, sources=[js.point_source([0.5, 7.0], s)]), cloud)
+
+
+def test_a_linear_solution_is_not_singular_at_the_corners_of_an_interface():
+    """A square in a square of the same material, u = x: rings around its corners see it from unlike directions."""
+    inner, box = js.sdf.rectangle((0.6, 0.6), (0.9, 0.9)), ((0.0, 0.0), (1.0, 1.0))
+    around = js.sdf.difference(js.sdf.rectangle(*box), inner)
+    cloud = js.regions({"in": inner, "out": around}, box, 0.05)
+    bcs = {"boundary": js.dirichlet(lambda x: x[0]), "in|out": js.interface(conduction({"in": 1.0, "out": 1.0}))}
+    sol = js.solve(js.Problem({"in": laplace, "out": laplace}, bcs), cloud, order=2)
+    assert np.abs(sol.u - cloud.points[:, 0]).max() < 1e-12 and sol.flags == []
