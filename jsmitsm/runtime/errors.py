@@ -33,6 +33,7 @@ SYMPTOMS = {
     "The estimated error is": "estimate",
     "No order reaches the tolerance": "tolerance",
     "The data may not balance": "balance",
+    "do not resolve the kernel": "kernel",
     "where regions meet": "meeting",
     "The estimated error in time": "time",
     "Between neighbouring particles convection": "drift",
@@ -57,9 +58,9 @@ REFUSALS = {
     "do not determine the solution": "resonance",
 }
 PAGES = {
-    "problems": "bcs constraint constraints field fields indices params pde periodic problem sources unknowns",
+    "problems": "bcs constraint constraints field fields indices integral params pde periodic problem sources unknowns",
     "clouds": "a b bounds cloud groups hi holes jitter lo n normals points sdf shape spacing vertices",
-    "regions": "interfaces region regions shapes",
+    "regions": "interfaces lattice region regions shapes",
     "choosing": "basis_terms d depth formulation h kernel method order radius size stencils",
     "time": "damping save scheme steps t",
     "modes": "count mass near",
