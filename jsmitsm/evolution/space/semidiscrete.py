@@ -42,6 +42,8 @@ class Semidiscrete:
         self.free, self.held = pencil.free, pencil.held
         stiff, source, given = pencil.A, pencil.B, pencil.Bg
         masses = [self._times_mass(source, j) for j in ((1, 2) if self.second else (1,))]
+        if timed.values:
+            stiff = _sum(stiff, self._times_mass(source, 0))
         if damping and self.second:
             masses[0] = _sum(masses[0], self._damping(masses[1], damping))
         elif damping:
@@ -115,7 +117,7 @@ class Semidiscrete:
         return Sparse(product.data, rows, cols, mass.shape)
 
     def _times_mass(self, source: Sparse, order: int) -> Sparse:
-        """B M: the source of a particle's equation from the rates of its fields."""
+        """B M: the source of a particle's equation from the rates of its fields, of order 0 from their values."""
         mass = self.timed.mass(order, self.points, (np.asarray(0.0), self.params))  # of t it is free
         fields, concrete = self.fields, not is_traced(mass, source.values)
         values, rows, cols = [], [], []
