@@ -13,9 +13,10 @@ from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.discretization.coefficients import slot_series
 from jsmitsm.discretization.layout import discretize
 from jsmitsm.discretization.pencil.assemble import assemble_pencil
+from jsmitsm.discretization.pencil.fits import local_fits
 from jsmitsm.equation.field import RATE
 from jsmitsm.evolution.space.convection import flag_divergence, refuse_convection
-from jsmitsm.evolution.space.semidiscrete import Driver, Semidiscrete, local_fits
+from jsmitsm.evolution.space.semidiscrete import Driver, Semidiscrete
 from jsmitsm.evolution.space.timed import Timed
 from jsmitsm.evolution.steps.newton import Newton
 from jsmitsm.evolution.steps.stepping import RadauStepper, Stepper
@@ -113,7 +114,9 @@ class Run:
         timed, began = self.timed, time.perf_counter()
         problem = timed.at(t, self.params)
         self.counts["pencils"] += 1
-        options: dict[str, Any] = {"order": self.order, "mass": timed.sourced, "stencils": self.stencils, "depth": self.depth}
+        options: dict[str, Any] = {
+            "order": self.order, "mass": timed.sourced, "stencils": self.stencils, "depth": self.depth
+        }  # fmt: skip
         reference = None
         if not timed.quasilinear:
             with jax.ensure_compile_time_eval():  # under jit, too, what is known is computed

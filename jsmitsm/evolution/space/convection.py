@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from jsmitsm.discretization.pencil.fits import local_fits
 from jsmitsm.equation.field import unit
-from jsmitsm.evolution.space.semidiscrete import Semidiscrete, local_fits
+from jsmitsm.evolution.space.semidiscrete import Semidiscrete
 
 # Cell Peclet numbers |v| h / eps: up to the first the recursion is stable, beyond the second nothing is.
 MODERATE, MOST = 2.0, 5.0

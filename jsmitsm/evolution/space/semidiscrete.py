@@ -12,15 +12,14 @@ import numpy as np
 
 from jsmitsm.discretization.coefficients import conditions_of
 from jsmitsm.discretization.pencil.assemble import Pencil
-from jsmitsm.discretization.pencil.local import source_stencils
+from jsmitsm.discretization.pencil.fits import local_fits
 from jsmitsm.discretization.pencil.sparse import Sparse
-from jsmitsm.evolution.space.local_fits import LocalFits, StateFit
+from jsmitsm.evolution.space.local_fits import StateFit
 from jsmitsm.evolution.space.system import System
 from jsmitsm.evolution.space.timed import Timed
 from jsmitsm.evolution.steps.tableaux import Sampling
 from jsmitsm.runtime.collector import uncollected
 from jsmitsm.runtime.tracers import any_number, concrete, is_traced
-from jsmitsm.taylor.multi_indices import count
 
 # Steps from which on those to come are looked at together, and the numbers that this may take at a time.
 MANY, NUMBERS = 64, 4e6
@@ -348,19 +347,6 @@ class Driver:
         last = k == len(self._starts) - 1
         index = np.append(np.arange(at, at + m), block[0].shape[1] - 1 if last else at + m)
         return [v[:, index] for v in block]
-
-
-def local_fits(disc: Any, degree: int, alone: bool = False) -> LocalFits:
-    """Polynomials of this degree around all particles; those of periodic partners are their lenders'.
-
-    alone: without the particle's own value, which they predict.
-    """
-    points = np.asarray(disc.cloud.points)
-    size = min(2 * count(disc.rec.dim, degree), len(points))
-    ids = np.flatnonzero(disc.partner == np.arange(len(points)))
-    near = source_stencils(disc, ids, size)[np.searchsorted(ids, disc.partner)]
-    owner = np.concatenate([np.arange(len(points)), disc.images.owner]).astype(int)
-    return LocalFits(np.asarray(disc.points), near, disc.partner[owner], degree, alone)
 
 
 def _sum(first: Sparse, second: Sparse) -> Sparse:
