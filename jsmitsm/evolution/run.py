@@ -15,7 +15,7 @@ from jsmitsm.discretization.layout import discretize
 from jsmitsm.discretization.pencil.assemble import assemble_pencil
 from jsmitsm.discretization.pencil.fits import local_fits
 from jsmitsm.equation.field import RATE
-from jsmitsm.evolution.space.convection import flag_divergence, refuse_convection
+from jsmitsm.evolution.space.convection import flag_divergence, flag_open, refuse_convection
 from jsmitsm.evolution.space.semidiscrete import Driver, Semidiscrete
 from jsmitsm.evolution.space.timed import Timed
 from jsmitsm.evolution.steps.newton import Newton
@@ -135,6 +135,7 @@ class Run:
             refuse_convection(semi, self.flags)
             if timed.flow is not None:
                 flag_divergence(semi, self.start[0], self.flags)
+                flag_open(semi, self.flags)
         self.told = list(pencil.health)
         self._flag_signs(pencil)
         if timed.flow is not None:

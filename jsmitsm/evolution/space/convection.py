@@ -75,6 +75,19 @@ def flag_divergence(semi: Semidiscrete, start: Any, flags: list[str]) -> None:
         )
 
 
+def flag_open(semi: Semidiscrete, flags: list[str]) -> None:
+    """A flag where the pressure has no condition that is known to serve."""
+    flow = semi.timed.flow
+    assert flow is not None
+    if flow.open:
+        names = ", ".join(map(repr, flow.open))
+        flags.append(
+            f"On {names} neither all velocities are given nor anything of the pressure, field {flow.pressure}, and "
+            "errors may be some percent there: give the pressure, as at an outlet, or its slope along the normal, as "
+            "the momentum equations have it."
+        )
+
+
 def _coupled(whole: Any, e: int) -> bool:
     """Whether an equation of first order drives its field by another's, as first-order forms of waves do."""
     return any(k != e and sum(b) == 1 and p for (k, b), p in zip(whole.slots, whole.pattern[e]))
