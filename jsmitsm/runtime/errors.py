@@ -39,6 +39,7 @@ SYMPTOMS = {
     "Between neighbouring particles convection": "drift",
     "has the wrong sign": "sign",
     "free of divergence": "divergence",
+    "anything of the pressure": "outlet",
     "are not resolved, or spurious": "modes",
     "shorter than four": "modes",
     "far from self-adjoint": "self-adjoint",
