@@ -76,11 +76,11 @@ def with_multiplier(data: Any, r: Any, c: Any, b: Any, ids: np.ndarray) -> tuple
     )  # fmt: skip
 
 
-def spread(misfit: np.ndarray | None, dim: int) -> float:
+def spread(misfit: Any, dim: int) -> Any:
     """The median of misfits (N,), in parts of the range, added up across the domain; zero below ``EVEN``."""
-    assert misfit is not None
-    found = float(np.median(misfit)) * len(misfit) ** (1.0 / dim)
-    return found if found > EVEN else 0.0
+    xp = jnp if is_traced(misfit) else np
+    found = xp.median(misfit) * len(misfit) ** (1.0 / dim)
+    return xp.where(found > EVEN, found, 0.0)
 
 
 def imbalance(turned: Callable[[Any], Any], x: Any, b: Any, n: int) -> Any:

@@ -32,6 +32,8 @@ from jsmitsm.solution.statistics import of_run
 # Under a JAX transform a system is taken for singular whose solution outgrows its right-hand side by so many times the
 # usual condition, and data for unbalanced that leave this part of them: there no other order is compared.
 GROWN, BALANCED = 1e4, 1e-2
+# ... or, in the least-squares form, leave so much of the range in all fits, see ``jsmitsm.solution.balance.EVEN``.
+SPREAD = 1e-3
 # What an equation and a condition say of one particle may differ by this part of the solution.
 CONTRADICTION = 1e-6
 
@@ -150,7 +152,9 @@ class Run:
 
         altered: a function of the system's entries, their rows and columns and the right-hand side that returns others.
         """
-        data, r, c, b = self.assembled(nums)
+        # What the least-squares form leaves of data that may not balance is looked at below.
+        parts: list[Any] | None = [] if self.floating and self.disc.linear and is_traced(vars(nums)) else None
+        data, r, c, b = self.assembled(nums, parts)
         if altered is not None:
             data, r, c, b = altered(data, r, c, b)
         start = time.perf_counter()
@@ -160,6 +164,8 @@ class Run:
         if is_traced(values):
             known = concrete(values)
             finite = jnp.isfinite(values) if known is None else np.isfinite(np.asarray(known))
+            if parts:
+                good &= spread(self._misfit_of(nums, values, parts), self.disc.rec.dim) <= SPREAD
             return values, finite.all() & good
         self.keep(nums, values)
         self._check_degenerate(nums, values)
@@ -329,7 +335,7 @@ class Run:
         """
         if self.formulation != "lsq":
             return self.imbalance
-        return spread(self.misfit, self.disc.rec.dim) if self.disc.linear else 0.0
+        return float(spread(self.misfit, self.disc.rec.dim)) if self.disc.linear else 0.0
 
     def _imbalance_at(self, taylor: Any, order: int) -> float:
         """The same of the same problem with method S of another order."""
@@ -366,8 +372,11 @@ class Run:
         """By how much each particle's value misses its local fit, in parts of the range; of the least-squares form."""
         if self.formulation != "lsq" or self.nums is None or self.values is None:
             return None
-        leading = np.array(self.disc.rec.weights) == 0
-        return misfit(self.disc, self.nums, self.values) / scales(self.values[:, leading]).max()
+        return self._misfit_of(self.nums, self.values)
+
+    def _misfit_of(self, nums: Numbers, values: Any, parts: list[Any] | None = None) -> Any:
+        ranges = scales(values[:, np.array(self.disc.rec.weights) == 0])
+        return misfit(self.disc, nums, values, parts) / ranges.max()
 
     def condition_numbers(self) -> tuple[np.ndarray, float]:
         """Of the particles' moment matrices (N,), and of the global system."""

@@ -33,7 +33,7 @@ SHORTEST, REFUSED = 1.0 / 16.0, 12
 ROUNDING, ROUND_OFF, STALLED = 10 * np.finfo(float).eps, 1e-6, 1e-7
 # Steps of less than CLOSE of the solution that fall to no less than SLOW of the one before converge linearly, and are
 # mixed with up to DEPTH that came before.
-SLOW, CLOSE, DEPTH = 0.25, 2e-2, 4
+SLOW, CLOSE, DEPTH = 0.05, 2e-2, 4
 # Where only the first full step tells how large the solution is, it may be this much larger than that.
 WARY = 0.01
 NOTHING = "the equation says nothing"
@@ -192,7 +192,8 @@ def _damped(record: Record, here: Iterate, target: Iterate) -> Found:
                 return found()
             else:
                 part, refused = part / 2.0, refused + 1
-        rate = next_length / length
+        # What a full step leaves of a difference; a mixed one is shorter than that tells.
+        rate = distance(after, target) / max(distance(new, here), np.finfo(float).tiny)
         record.rate = rate if part == 1.0 else record.rate
         slow = part == 1.0 and rate > SLOW and next_length < CLOSE * after.size
         history = [*(history[-DEPTH:] if slow else []), (new, after)]
