@@ -142,12 +142,12 @@ def table(parts: dict[str, list[dict[str, Any]]]) -> dict[str, Any]:
 
 
 def main(given: Namespace) -> None:
-    old = json.loads(DATA.read_text()) if DATA.exists() else {"parts": {}}
+    parts = json.loads(DATA.read_text())["parts"] if given.names and DATA.exists() else {}
     for name in given.names or PARTS:
-        rows = old["parts"][name] = []
+        rows = parts[name] = []
         for row in PARTS[name](given.quick):
             rows.append(row)
-            text = {"machine": describe(), "parts": old["parts"], "tables": {"cavity": table(old["parts"])}}
+            text = {"machine": describe(), "parts": parts, "tables": {"cavity": table(parts)}}
             DATA.write_text(json.dumps(text, separators=(",", ":")).replace("},{", "},\n{") + "\n")
 
 
