@@ -8,7 +8,11 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from jsmitsm.discretization.coefficients import Numbers
+from jsmitsm.discretization.layout import Discretization
+from jsmitsm.discretization.least_squares import misfit
 from jsmitsm.runtime.tracers import is_traced
+from jsmitsm.solution.flags import scales
 from jsmitsm.taylor.multi_indices import HIGHEST
 
 # A solvable pure Neumann problem leaves a mean residual below this part of its data,
@@ -76,10 +80,26 @@ def with_multiplier(data: Any, r: Any, c: Any, b: Any, ids: np.ndarray) -> tuple
     )  # fmt: skip
 
 
-def spread(misfit: Any, dim: int) -> Any:
-    """The median of misfits (N,), in parts of the range, added up across the domain; zero below ``EVEN``."""
-    xp = jnp if is_traced(misfit) else np
-    found = xp.median(misfit) * len(misfit) ** (1.0 / dim)
+def relative_misfit(disc: Discretization, nums: Numbers, values: Any, parts: list[Any] | None = None) -> Any:
+    """By how much the particles' values miss their local fits, in parts of the range; parts: as of ``misfit``."""
+    return misfit(disc, nums, values, parts) / scales(values[:, _leading(disc)]).max()
+
+
+def _leading(disc: Discretization) -> np.ndarray:
+    """The fields that count all derivatives of the equations, (F,) bool."""
+    return np.array(disc.rec.weights) == 0
+
+
+def spread(disc: Discretization, missed: Any) -> Any:
+    """The median of relative misfits, added up across the domain; zero below ``EVEN``.
+
+    Where all that is compared is held, values are met exactly, whatever the data.
+    """
+    free = ~disc.held[:, _leading(disc)].all(axis=1)[disc.active]
+    if not free.any():
+        return 0.0
+    xp = jnp if is_traced(missed) else np
+    found = xp.median(missed[free]) * len(disc.cloud) ** (1.0 / disc.rec.dim)
     return xp.where(found > EVEN, found, 0.0)
 
 

@@ -15,7 +15,7 @@ from jsmitsm.discretization import health
 from jsmitsm.discretization.coefficients import Numbers, numbers
 from jsmitsm.discretization.held_particles import with_held_expansions
 from jsmitsm.discretization.layout import Class, Discretization, discretize
-from jsmitsm.discretization.least_squares import least_squares, misfit
+from jsmitsm.discretization.least_squares import least_squares
 from jsmitsm.discretization.leave_one_out import matrix, right_side, with_held
 from jsmitsm.discretization.operator_kind import prefers_least_squares, usual_condition
 from jsmitsm.discretization.rows import all_coefficients, all_rows
@@ -24,8 +24,8 @@ from jsmitsm.linear import linsolve
 from jsmitsm.particle.moments import Row
 from jsmitsm.runtime.errors import SolveError, some
 from jsmitsm.runtime.tracers import concrete, is_traced
-from jsmitsm.solution.balance import imbalance, spread, unbalanced, with_multiplier
-from jsmitsm.solution.flags import flags, scales
+from jsmitsm.solution.balance import imbalance, relative_misfit, spread, unbalanced, with_multiplier
+from jsmitsm.solution.flags import flags
 from jsmitsm.solution.memory import refuse_too_large
 from jsmitsm.solution.statistics import of_run
 
@@ -165,7 +165,7 @@ class Run:
             known = concrete(values)
             finite = jnp.isfinite(values) if known is None else np.isfinite(np.asarray(known))
             if parts:
-                good &= spread(self._misfit_of(nums, values, parts), self.disc.rec.dim) <= SPREAD
+                good &= spread(self.disc, relative_misfit(self.disc, nums, values, parts)) <= SPREAD
             return values, finite.all() & good
         self.keep(nums, values)
         self._check_degenerate(nums, values)
@@ -335,7 +335,7 @@ class Run:
         """
         if self.formulation != "lsq":
             return self.imbalance
-        return float(spread(self.misfit, self.disc.rec.dim)) if self.disc.linear else 0.0
+        return float(spread(self.disc, self.misfit)) if self.disc.linear else 0.0
 
     def _imbalance_at(self, taylor: Any, order: int) -> float:
         """The same of the same problem with method S of another order."""
@@ -372,11 +372,7 @@ class Run:
         """By how much each particle's value misses its local fit, in parts of the range; of the least-squares form."""
         if self.formulation != "lsq" or self.nums is None or self.values is None:
             return None
-        return self._misfit_of(self.nums, self.values)
-
-    def _misfit_of(self, nums: Numbers, values: Any, parts: list[Any] | None = None) -> Any:
-        ranges = scales(values[:, np.array(self.disc.rec.weights) == 0])
-        return misfit(self.disc, nums, values, parts) / ranges.max()
+        return relative_misfit(self.disc, self.nums, self.values)
 
     def condition_numbers(self) -> tuple[np.ndarray, float]:
         """Of the particles' moment matrices (N,), and of the global system."""
