@@ -20,8 +20,8 @@ COMPATIBLE = 1e-6
 # or one that falls to less than this part of itself from one order to two orders higher.
 KEPT = 0.5
 # In the least-squares form data that do not balance are spread evenly over all fits. A median misfit, added up across
-# the domain, of less than this is what they leave that balance to half a percent; measured, it is 0.024 to 0.034 times
-# the part of them that does not, on any cloud and at any order.
+# the domain, of less than this is what they leave that balance to half a percent; measured over all particles of large
+# clouds, it is 0.024 to 0.034 times the part of them that does not, at any order.
 EVEN = 1e-4
 # Less than the first changes the solution by less than the discretisation does, and slopes taken at corners leave as
 # much. Between the fields of a system both vary more with the order: less than the second is a doubt, not a refusal.

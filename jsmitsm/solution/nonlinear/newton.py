@@ -1,8 +1,10 @@
 """Newton's method: it arrives from far, ends quadratically, and its end carries derivatives.
 
 The local fits solve the linearised recursion, so that a step from expansions U leads to values and expansions V with
-R(U) + R'(U) (V - U) = 0, for both together. What it lacks of a quadratic rate is the misfit of the fits, which falls
-with the order.
+R(U) + R'(U) (V - U) = 0, for both together. What it lacks of a quadratic rate is the misfit of the fits times the
+curvature of the equation, as in Gauss's and Newton's method for least squares: a step turns the local solutions among
+which the next fit is sought. It falls with the misfit (a driven cavity at order 6: 0.2 on 17 x 17 particles, 0.02 on
+27 x 27), and steps that end linearly are mixed.
 """
 
 from __future__ import annotations
