@@ -180,7 +180,8 @@ class Evolution:
     def error_estimate(self) -> Array:
         """Estimated error at every particle and saved time.
 
-        In space by the defect that a pencil of order p + 2 finds, in time by the embedded scheme. Computed when asked.
+        In space by the defect that a pencil of order p + 2 finds, in time by the embedded scheme. Computed when asked;
+        from then on an error above 2 % of the solution is a flag.
 
         Returns
         -------

@@ -13,7 +13,8 @@ from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.discretization.layout import table
 from jsmitsm.discretization.regions.layout import Regions
 from jsmitsm.modes.estimate import conditions, errors
-from jsmitsm.modes.question import Question, mass_at
+from jsmitsm.modes.mass import mass_times
+from jsmitsm.modes.question import Question
 from jsmitsm.modes.spectrum import Pairs
 from jsmitsm.runtime import notebooks
 from jsmitsm.runtime.arrays import Array, ArrayLike
@@ -213,7 +214,7 @@ class Modes:
         written, number = q.problem, jnp.asarray(value)
 
         def shifted(operator: Any, mass: Any) -> Any:
-            return lambda u, x, *params: operator(u, x, *params) - number * mass_at(written, mass, x) * u(x)
+            return lambda u, x, *params: operator(u, x, *params) - number * mass_times(written, mass, u, x)
 
         disc: Any = q.pencil.layout.disc
         recipe = Recipe("S", q.order, None, "loo", written.fields, q.depth)
@@ -245,9 +246,8 @@ class Modes:
         """The largest entry (k,) of A u - lambda B mass u, relative to the sum of the sizes of its terms."""
         found = self._host("residuals")
         q = self._known("residuals")
-        a, b = (m.host[q.pencil.free][:, q.pencil.free] for m in (q.pencil.A, q.pencil.B))
-        weighted = np.asarray(q.weights).reshape(-1)[q.pencil.free][:, None] * found.right
-        rest = np.abs(a @ found.right - (b @ weighted) * found.values).max(axis=0)
+        a = q.stiff.host
+        rest = np.abs(a @ found.right - (q.inert.host @ found.right) * found.values).max(axis=0)
         return rest / (abs(a) @ np.abs(found.right)).max(axis=0)
 
     def _host(self, what: str) -> Pairs:

@@ -38,7 +38,8 @@ def constraint(functional: Callable[..., Any], value: float = 0.0) -> Constraint
     ----------
     functional : function
         ``functional(sol)`` returns a scalar, made by JAX of what the solution offers: ``sol.u``, ``sol(points)``,
-        ``sol.grad(points)``, ``sol.integral()``, ``sol.flux(group)``, ``sol.unknowns["name"]``.
+        ``sol.grad(points)``, ``sol.integral()``, ``sol.flux(group)``, ``sol.unknowns["name"]``; with several regions
+        ``sol(points, region="a")``, ``sol.integral(region="a")``, ``sol.flux("a|b", k, region="a")``.
     value : float
         What it must be, in the units of the functional.
 
