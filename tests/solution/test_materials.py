@@ -227,6 +227,7 @@ def test_conditions_are_never_guessed():
     refused(r"make it with js.regions", cloud=js.interval(0.0, 1.0, 9), bcs={})
     refused(r"boundary group\(s\) \['boundary'\]", bcs={"a|b": good})
     refused(r"flux for \['a', 'c'\]", bcs={**ends, "a|b": js.interface({"a": flux["a"], "c": flux["b"]})})
+    refused(r"resistance: -2 came, expected none below zero", bcs={**ends, "a|b": js.interface(flux, resistance=-2.0)})
     refused(r"does not depend on u", bcs={**ends, "a|b": js.interface({"a": flux["a"], "b": lambda u, x, n: 1.0})})
     refused(r"takes 2, two for each field", bcs={**ends, "a|b": js.interface(residual=lambda a, b, x, n: a(x) - b(x))})
     turned = {"a": flux["a"], "b": lambda u, x, n: -2.0 * n @ js.grad(u)(x)}
