@@ -130,6 +130,7 @@ class Problem:
             return None
         return found[0][1] if found[0][0] is None else {str(name): kernel for name, kernel in found}
 
+    @explaining
     def replace(self, **changes: Any) -> Problem:
         """The same problem with other parts.
 

@@ -129,3 +129,20 @@ def combined(parts: list[tuple[Any, Sparse]]) -> tuple[Any, np.ndarray, np.ndarr
     xp = jnp if is_traced([(f, m.values) for f, m in parts]) else np
     values = xp.concatenate([f * xp.asarray(m.values) for f, m in parts])
     return values, np.concatenate([m.rows for _, m in parts]), np.concatenate([m.cols for _, m in parts])
+
+
+def product(first: Sparse, second: Sparse) -> Sparse:
+    """The product of two matrices; where JAX traces values, by all pairs of entries that meet."""
+    shape = first.shape[0], second.shape[1]
+    if not is_traced(first.values, second.values):
+        whole = (first.host @ second.host).tocoo()
+        rows, cols = (c.astype(int) for c in whole.coords)
+        return Sparse(whole.data, rows, cols, shape)
+    order = np.argsort(second.rows, kind="stable")
+    counts = np.bincount(second.rows, minlength=second.shape[0])
+    width, begin = counts[first.cols], (np.cumsum(counts) - counts)[first.cols]
+    one = np.repeat(np.arange(len(first.cols)), width)
+    two = order[np.arange(len(one)) - np.repeat(np.cumsum(width) - width, width) + begin[one]]
+    at, place = np.unique(first.rows[one] * shape[1] + second.cols[two], return_inverse=True)
+    values = jnp.zeros(len(at)).at[place].add(jnp.asarray(first.values)[one] * jnp.asarray(second.values)[two])
+    return Sparse(values, at // shape[1], at % shape[1], shape)

@@ -26,7 +26,7 @@ import numpy as np
 
 from jsmitsm.equation.unknowns.constraint import checked_number
 from jsmitsm.runtime.arrays import ArrayLike
-from jsmitsm.runtime.errors import refuse_masked, short
+from jsmitsm.runtime.errors import explaining, refuse_masked, short
 from jsmitsm.runtime.tracers import is_traced
 
 # Terms of the series, and the largest root(|m|) r for which they are enough and do not cancel beyond 1e-11.
@@ -43,6 +43,7 @@ class PointSource(NamedTuple):
         return "point_source(<traced>)" if is_traced(tuple(self)) else f"point_source({self.place}, {self.strength})"
 
 
+@explaining
 def point_source(x0: ArrayLike, strength: ArrayLike = 1.0) -> PointSource:
     """A source concentrated at one point: the residual of the pde is strength delta(x - x0).
 
