@@ -17,6 +17,12 @@ from jsmitsm.taylor.multi_indices import HIGHEST
 _OUTLIER = 4.0
 
 
+def conditions(question: Question, found: Pairs) -> np.ndarray:
+    """The condition numbers (k,) of the values: the sizes of both vectors where their product is one."""
+    dual = question.inert.host_transposed @ found.left
+    return np.linalg.norm(found.right, axis=0) * np.linalg.norm(dual, axis=0)
+
+
 @bar("error estimate", parts=PENCIL)
 def errors(question: Question, found: Pairs) -> np.ndarray:
     """Estimated errors (k,) of the values; infinite where there is no other order to compare with.

@@ -94,7 +94,7 @@ def _product(form: _Form, values: Any, x: Any) -> Any:
     """Many products: by scipy wherever only derivatives are traced, so that nothing of entries by columns is made."""
     if is_traced(values, x):
         return _times(values, form.rows, form.cols, jnp.asarray(x), form.shape[0])
-    return jnp.asarray(Sparse(values, form.rows, form.cols, form.shape).host @ np.asarray(x))
+    return jax.device_put(Sparse(values, form.rows, form.cols, form.shape).host @ np.asarray(x))
 
 
 def _product_forward(form: _Form, values: Any, x: Any) -> tuple[Any, Any]:
@@ -107,7 +107,7 @@ def _product_backward(form: _Form, kept: Any, bar: Any) -> tuple[Any, Any]:
         _, back = jax.vjp(lambda v, y: _times(v, form.rows, form.cols, y, form.shape[0]), values, jnp.asarray(x))
         return back(bar)
     matrix, bar = Sparse(values, form.rows, form.cols, form.shape), np.asarray(bar)
-    return jnp.asarray(sampled(matrix, bar, np.asarray(x))), jnp.asarray(matrix.host_transposed @ bar)
+    return jax.device_put((sampled(matrix, bar, np.asarray(x)), matrix.host_transposed @ bar))
 
 
 _product.defvjp(_product_forward, _product_backward)
