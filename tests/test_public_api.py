@@ -65,7 +65,7 @@ def in_a_fresh_process(code, **environment):
 
 
 def test_importing_is_light_and_changes_nothing():
-    """No scipy.spatial, no scipy.sparse, no matplotlib; not one option of JAX, nor numpy's, nor a backend started."""
+    """No scipy.spatial, scipy.sparse, matplotlib, Pallas; not one option of JAX, nor numpy's, nor a backend started."""
     code = """
 import sys, warnings
 import jax, numpy as np
@@ -74,12 +74,23 @@ before = dict(jax.config.values), np.geterr(), np.get_printoptions(), list(warni
 import jsmitsm
 assert before == (dict(jax.config.values), np.geterr(), np.get_printoptions(), list(warnings.filters))
 assert not bridge._backends, "importing started a backend"
-heavy = ("scipy.spatial", "scipy.sparse", "scipy.optimize", "matplotlib", "optax", "pyamg", "meshio", "shapely", "tqdm")
+heavy = ("scipy.spatial", "scipy.sparse", "scipy.optimize", "matplotlib", "optax", "pyamg", "meshio", "shapely", "tqdm",
+         "jax.extend.pallas")
 print([name for name in heavy if name in sys.modules])
 """
-    before = "import jax, sys; print([n for n in sys.modules if n.startswith('scipy.')])"
+    before = "import jax, sys; print([n for n in sys.modules if n.startswith(('scipy.', 'jax.extend.'))])"
     by_jax = ast.literal_eval(in_a_fresh_process(before))
     assert set(ast.literal_eval(in_a_fresh_process(code))) <= set(by_jax)
+
+
+def test_parts_of_jaxprs_are_those_of_jax():
+    """Imported from where they are defined, they are what JAX gives to everybody."""
+    from jax.extend import core
+
+    from jsmitsm.runtime import jaxprs
+
+    for name in ("ClosedJaxpr", "Jaxpr", "Literal", "Primitive", "jaxpr_as_fun"):
+        assert getattr(jaxprs, name) is getattr(core, name)
 
 
 def test_importing_costs_little_over_jax():

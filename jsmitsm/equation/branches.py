@@ -21,12 +21,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import Literal
 
 from jsmitsm.equation.field import field_p, frozen_p
 from jsmitsm.equation.linearizing import control, inner_jaxprs, is_mark, open_fields, slots_of
 from jsmitsm.equation.marks import ALONG, DIFFERENTIATED, MEANT
-from jsmitsm.runtime.jaxprs import bind, called, literal, program, scan_sizes
+from jsmitsm.runtime.jaxprs import Literal, bind, called, literal, program, scan_sizes
 from jsmitsm.runtime.tracers import concrete
 from jsmitsm.taylor.multi_indices import Slot
 

@@ -7,9 +7,8 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jax.extend.core import Literal
 
-from jsmitsm.runtime.jaxprs import DISCRETE, called, literal, scan_sizes
+from jsmitsm.runtime.jaxprs import DISCRETE, Literal, called, literal, scan_sizes
 from jsmitsm.taylor.elementwise import ELEMENTWISE, RULES
 from jsmitsm.taylor.movement import MOVEMENT
 from jsmitsm.taylor.series import Ring

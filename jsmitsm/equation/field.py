@@ -10,9 +10,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import Primitive
 from jax.interpreters import ad, batching
 
+from jsmitsm.runtime.jaxprs import Primitive
 from jsmitsm.taylor.multi_indices import MultiIndex, Slot, add
 
 # d^a u_k at a point.  Its derivative is the next higher derivative, which is all that

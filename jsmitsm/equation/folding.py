@@ -9,10 +9,8 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from jax.extend.core import Literal
-
 from jsmitsm.equation.dependence import Facts, facts_of, known, unknown
-from jsmitsm.runtime.jaxprs import EVERYTHING, Program, levels, literal
+from jsmitsm.runtime.jaxprs import EVERYTHING, Literal, Program, levels, literal
 
 
 def folded(written: Program) -> Program:

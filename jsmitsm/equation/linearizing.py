@@ -9,12 +9,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import Literal
 
 from jsmitsm.equation.field import Field, LocalField, field_p, frozen_p
 from jsmitsm.equation.folding import folded
 from jsmitsm.equation.marks import DIFFERENTIATED
-from jsmitsm.runtime.jaxprs import EVERYTHING, bind, called, inner_jaxprs, levels, literal, program, scan_sizes
+from jsmitsm.runtime.jaxprs import EVERYTHING, Literal, bind, called, inner_jaxprs, levels, literal, program, scan_sizes
 from jsmitsm.runtime.snapshot import snapshot
 from jsmitsm.runtime.tracers import owned
 from jsmitsm.taylor.elementwise import ELEMENTWISE

@@ -11,14 +11,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import Literal
 
 from jsmitsm.equation.branches import Branches
 from jsmitsm.equation.jumps import jumps
 from jsmitsm.equation.linearizing import Record, open_fields, slots_of
 from jsmitsm.equation.record_form import Form, is_fixed
 from jsmitsm.runtime.compiled import Same, fingerprint, kept, remembered
-from jsmitsm.runtime.jaxprs import EVERYTHING, NOTHING, inner_jaxprs, levels
+from jsmitsm.runtime.jaxprs import EVERYTHING, NOTHING, Literal, inner_jaxprs, levels
 from jsmitsm.runtime.tracers import any_number, frozen, is_traced
 from jsmitsm.runtime.whole_program import in_one_program
 from jsmitsm.taylor.jets import evaluate, plain

@@ -19,13 +19,13 @@ from typing import Any, Literal, TypeAlias, get_args
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
 from jsmitsm.linear.factor_cache import Settings, clear_cache, factorisations, lookup
 from jsmitsm.linear.solver_choice import DENSE_MAX, refuse_too_large
 from jsmitsm.linear.sparse import Factor
 from jsmitsm.runtime.errors import SingularMatrix, SolveError
+from jsmitsm.runtime.jaxprs import Primitive
 from jsmitsm.runtime.tracers import is_traced
 
 __all__ = [
@@ -220,7 +220,7 @@ def _on_host(arrays: Sequence[Any], b: Any, settings: Settings, transpose: bool)
 
 
 def _impl(data: Any, rows: Any, cols: Any, b: Any, *, settings: Settings, transpose: bool) -> Any:
-    return jnp.asarray(_on_host((data, rows, cols), b, settings, transpose))
+    return jax.device_put(_on_host((data, rows, cols), b, settings, transpose))  # asarray would compile, by length
 
 
 def _jvp(primals: Any, tangents: Any, *, settings: Settings, transpose: bool) -> Any:

@@ -18,11 +18,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
 from jsmitsm.linear import linsolve
 from jsmitsm.runtime.errors import SingularMatrix, SolveError
+from jsmitsm.runtime.jaxprs import Primitive
 
 # Up to so many unknowns, or where so large a part of all values is wanted, the matrix is dense.
 _DENSE, _PART = 200, 0.25
@@ -255,7 +255,7 @@ def _on_host(a: Any, c: Any, pattern: Pattern, near: float, count: int, size: fl
 
 
 def _impl(a: Any, c: Any, **given: Any) -> list[Any]:
-    return [jnp.asarray(x) for x in _on_host(a, c, **given)]
+    return jax.device_put(_on_host(a, c, **given))
 
 
 def _avals(a: Any, c: Any, *, pattern: Pattern, near: float, count: int, size: float) -> list[Any]:

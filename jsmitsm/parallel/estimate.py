@@ -11,10 +11,12 @@ from jsmitsm.discretization.resolution.digits import room
 from jsmitsm.parallel.local import Local, Settings
 from jsmitsm.parallel.solution import ParallelSolution
 from jsmitsm.parallel.solving import assembled
+from jsmitsm.runtime.errors import explaining
 from jsmitsm.solution.estimate import compared
 from jsmitsm.taylor.multi_indices import HIGHEST
 
 
+@explaining
 def error_estimate(sol: ParallelSolution) -> np.ndarray:
     """Estimated error |u - u_exact| at the own particles; see ``js.Solution.error_estimate``.
 

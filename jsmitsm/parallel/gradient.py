@@ -19,10 +19,12 @@ from jsmitsm.equation.problem import Problem
 from jsmitsm.parallel.distributed import ParallelCloud
 from jsmitsm.parallel.local import Local, local_kernel, local_problem
 from jsmitsm.parallel.solving import numbered, solve
+from jsmitsm.runtime.errors import explaining
 
 WRT = ("params", "points")
 
 
+@explaining
 def value_and_grad(
     objective: Callable[..., Any], problem: Problem, cloud: Cloud | ParallelCloud, *, wrt: str = "params",
     **options: Any,

@@ -18,11 +18,12 @@ from jsmitsm.parallel.solution import ParallelSolution
 from jsmitsm.parallel.system import SOLVERS, System
 from jsmitsm.parallel.team import Team, team
 from jsmitsm.particle.kernels import Kernel
-from jsmitsm.runtime.errors import did_you_mean
+from jsmitsm.runtime.errors import did_you_mean, explaining
 from jsmitsm.solution.arguments import Depth, check
 from jsmitsm.solution.fit import Recipe
 
 
+@explaining
 def solve(
     problem: Problem, cloud: Cloud | ParallelCloud, *, method: str = "S", order: int = 4, depth: Depth = "auto",
     kernel: Kernel | None = None, formulation: str = "auto", solver: str = "auto",

@@ -9,9 +9,8 @@ from typing import Any
 
 import jax
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
-from jsmitsm.runtime.jaxprs import derivative
+from jsmitsm.runtime.jaxprs import ClosedJaxpr, Jaxpr, Literal, derivative
 
 
 class Same:

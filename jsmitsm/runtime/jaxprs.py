@@ -9,7 +9,21 @@ from typing import Any
 
 import jax
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
+
+# What jaxprs are made of, for the whole package. JAX's public place for it, jax.extend.core, is these very objects, and
+# loads Pallas with them: most of what importing this package would take.
+try:
+    from jax._src.core import ClosedJaxpr as ClosedJaxpr
+    from jax._src.core import Jaxpr as Jaxpr
+    from jax._src.core import Literal as Literal
+    from jax._src.core import Primitive as Primitive
+    from jax._src.core import jaxpr_as_fun as jaxpr_as_fun
+except ImportError:
+    from jax.extend.core import ClosedJaxpr as ClosedJaxpr
+    from jax.extend.core import Jaxpr as Jaxpr
+    from jax.extend.core import Literal as Literal
+    from jax.extend.core import Primitive as Primitive
+    from jax.extend.core import jaxpr_as_fun as jaxpr_as_fun
 
 # Piecewise constant in their arguments: the degree 0 decides.
 DISCRETE = frozenset(

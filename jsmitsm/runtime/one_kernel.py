@@ -18,7 +18,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
+
+from jsmitsm.runtime.jaxprs import ClosedJaxpr, Jaxpr, Literal
 
 # The attribute is XLA's own and what sets it is experimental in JAX: only versions that the tests have passed with.
 _TRIED = ((0, 10),)

@@ -9,10 +9,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 
 from jsmitsm.runtime.compiled import fingerprint
-from jsmitsm.runtime.jaxprs import inner_jaxprs
+from jsmitsm.runtime.jaxprs import ClosedJaxpr, inner_jaxprs, jaxpr_as_fun
 from jsmitsm.runtime.tracers import is_traced
 
 # JAX looks up functions by their identity in caches of its own: not the one that it is given here, but those that this

@@ -7,8 +7,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import Primitive
 from jax.interpreters import mlir
+
+from jsmitsm.runtime.jaxprs import Primitive
 
 # An operation on nothing: what is recorded records it, and it does not compute, nor compile, where nothing is.
 _probe_p = Primitive("jsmitsm_probe")

@@ -22,12 +22,12 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import Literal, Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
 
 from jsmitsm.runtime import one_kernel
 from jsmitsm.runtime.collector import uncollected
 from jsmitsm.runtime.compiler_options import on_cpu
+from jsmitsm.runtime.jaxprs import Literal, Primitive, jaxpr_as_fun
 from jsmitsm.runtime.size_classes import BLOCK
 from jsmitsm.runtime.threads import cores, side_by_side
 from jsmitsm.runtime.tracers import is_traced, recorded
@@ -325,7 +325,7 @@ def _impl(*arguments: Any, program: Program) -> list[Any]:
     out = jax.tree.leaves(program.run(*arguments))
     if program.on_host:
         avals = program.result(_avals(arguments)).avals
-        return [jnp.asarray(np.asarray(x, a.dtype)) for x, a in zip(out, avals, strict=True)]
+        return [jax.device_put(np.asarray(x, a.dtype)) for x, a in zip(out, avals, strict=True)]
     return out
 
 

@@ -35,7 +35,6 @@ class Report(Protocol):
 class Solution(Anywhere):
     """A solution at the particles, and anywhere through local Taylor polynomials.
 
-
     ``sol(points)`` evaluates it at points (M, D), ``sol.grad(points)`` its gradient.
 
     A solution is a pytree: it passes through ``jax.jit``, ``jax.grad`` and ``pickle``.
@@ -174,6 +173,7 @@ class Solution(Anywhere):
         """Whether the estimate knows defects, and ``correction`` more than the size of the error."""
         return not hasattr(self._fit, "error_estimate")
 
+    @explaining
     def correction(self) -> Correction:
         """What the error estimate is made of, for those who refine by it.
 
@@ -229,6 +229,7 @@ class Solution(Anywhere):
         found = [*(self._found or []), *self.stats.get("objections", []), *([] if self._share <= LARGE else [large])]
         return explained(found)
 
+    @explaining
     def condition_numbers(self) -> tuple[np.ndarray, float]:
         """Condition numbers of every particle's moment matrix and of the global system.
 

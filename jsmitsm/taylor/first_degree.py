@@ -14,9 +14,8 @@ from functools import lru_cache, partial, reduce
 from typing import Any
 
 import numpy as np
-from jax.extend.core import Literal
 
-from jsmitsm.runtime.jaxprs import CONSTANT_TERM, DISCRETE, EVERYTHING, called, levels, literal
+from jsmitsm.runtime.jaxprs import CONSTANT_TERM, DISCRETE, EVERYTHING, Literal, called, levels, literal
 from jsmitsm.taylor.elementwise import HOST
 
 Pair = tuple[np.ndarray, Any]

@@ -14,7 +14,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import Literal
 
 import jsmitsm.taylor.matrices  # noqa: F401  (registers its rules)
 import jsmitsm.taylor.movement  # noqa: F401  (registers its rules)
@@ -24,6 +23,7 @@ from jsmitsm.runtime.jaxprs import (
     CONSTANT_TERM,
     EVERYTHING,
     NOTHING,
+    Literal,
     bind,
     called,
     derivative,

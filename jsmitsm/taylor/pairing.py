@@ -12,9 +12,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
+from jsmitsm.runtime.jaxprs import Primitive
 from jsmitsm.taylor.multi_indices import add, count, index_of, multi_indices
 
 # Fewer pairs in a row than this are written out.

@@ -9,11 +9,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import ClosedJaxpr
 
 from jsmitsm.runtime.compiled import fingerprint, kept
 from jsmitsm.runtime.errors import IN_FUNCTIONS, in_words
-from jsmitsm.runtime.jaxprs import inlined, inner_jaxprs
+from jsmitsm.runtime.jaxprs import ClosedJaxpr, inlined, inner_jaxprs
 from jsmitsm.runtime.recall.recording import recalled
 from jsmitsm.runtime.snapshot import snapshot
 from jsmitsm.runtime.tracers import is_traced

@@ -9,9 +9,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import Literal
 
-from jsmitsm.runtime.jaxprs import bind, called
+from jsmitsm.runtime.jaxprs import Literal, bind, called
 
 
 class Pair(NamedTuple):
