@@ -80,6 +80,11 @@ def conditions_of(disc: Discretization, problem: Problem) -> tuple[Any, Any, Any
     return _at(other, held), given, gamma
 
 
+def held_values(disc: Discretization) -> Any:
+    """The values that conditions hold, at their places (N, F), zero elsewhere."""
+    return _at(disc, _held_values(disc))
+
+
 def _held_values(disc: Discretization) -> list[dict[int, Any]]:
     """Of every group the values (n,) of the fields that it holds."""
     return [{k: value() for k, value in group.held.items()} for group in disc.groups]

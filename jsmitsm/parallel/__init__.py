@@ -7,12 +7,13 @@ Imports show and what stands before it.
 
 from jsmitsm.parallel.distributed import ParallelCloud, read
 from jsmitsm.parallel.estimate import error_estimate
+from jsmitsm.parallel.factorization import ParallelFactorization, factorize
 from jsmitsm.parallel.files import save
 from jsmitsm.parallel.gradient import value_and_grad
 from jsmitsm.parallel.solution import ParallelSolution, evaluate, norm
 from jsmitsm.parallel.solving import solve
 
 __all__ = [
-    "ParallelCloud", "ParallelSolution", "error_estimate", "evaluate", "norm", "read", "save", "solve",
-    "value_and_grad",
+    "ParallelCloud", "ParallelFactorization", "ParallelSolution", "error_estimate", "evaluate", "factorize", "norm",
+    "read", "save", "solve", "value_and_grad",
 ]  # fmt: skip

@@ -18,7 +18,7 @@ from jsmitsm.discretization.rows import all_rows
 from jsmitsm.equation.problem import Problem
 from jsmitsm.parallel.distributed import ParallelCloud
 from jsmitsm.parallel.local import Local, local_kernel, local_problem
-from jsmitsm.parallel.solving import numbered, solve
+from jsmitsm.parallel.solving import solve
 
 WRT = ("params", "points")
 
@@ -70,16 +70,19 @@ def value_and_grad(
     halo, disc = local.halo, local.disc
     given = () if problem.params is None else (problem.params,)
     with us.phase():
+        if not disc.linear:
+            raise ValueError(
+                "problem: gradients of nonlinear problems are not made for several processes; use js.solve"
+            )
         x = sol._values[~disc.held]
         part = lambda u: jnp.asarray(objective(u, jnp.asarray(sol.points), *given))  # noqa: E731
         value, slope = jax.value_and_grad(part)(jnp.asarray(sol.u))
         free = ~disc.held[halo.ids]
         slope = np.asarray(slope).reshape(free.shape)[free]
     weights = sol.system.solve(slope, transpose=True)
-    own, _ = numbered(us, local)
     with us.phase():
         points = jnp.asarray(local.cloud.points)
-        lagrangian = _lagrangian(objective, problem, local, x, weights, own)
+        lagrangian = _lagrangian(objective, problem, local, x, weights, local.owned)
         which = 0 if wrt == "params" else 1
         found = jax.tree.map(np.asarray, jax.grad(lagrangian, argnums=which)(problem.params, points))
     total = float(us.total(float(value)))

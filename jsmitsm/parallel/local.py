@@ -6,18 +6,22 @@ neighbours have most, how large are stencils that a repair widens) the processes
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 from typing import Any
 
 import jax
 import numpy as np
 
 from jsmitsm.cloud.neighbours import EVEN_SAMPLE, Stencils, is_even, kept_distances, nearest
-from jsmitsm.discretization.coefficients import Numbers, numbers
-from jsmitsm.discretization.layout import Class, discretize, sorted_classes, table
+from jsmitsm.discretization import health
+from jsmitsm.discretization.coefficients import Numbers, numbers, slot_series
+from jsmitsm.discretization.held_particles import with_held_expansions
+from jsmitsm.discretization.layout import Class, Discretization, discretize, sorted_classes, table
 from jsmitsm.discretization.operator_kind import information_travels
 from jsmitsm.discretization.resolution.digits import LOOKED_AT
-from jsmitsm.discretization.rows import all_coefficients
+from jsmitsm.discretization.rows import all_coefficients, all_rows
 from jsmitsm.discretization.supports import Part
 from jsmitsm.equation.bcs import Condition
 from jsmitsm.equation.conditions import refuse_counts
@@ -34,6 +38,11 @@ from jsmitsm.solution.run import Run
 FIRST, POOL = 2.2, 10
 # A halo that falls short is widened to this more than what was missed.
 MORE = 1.05
+# Particles whose rows are made at a time: enough to fill a program, few enough not to be seen beside the matrix.
+AT_ONCE = 8192
+
+# What is made of the rows of some particles: (discretisation of these alone, numbers, classes, rows) -> anything.
+Use = Callable[[Discretization, Numbers, list[Class], list[Row]], Any]
 
 
 @dataclass
@@ -46,6 +55,7 @@ class Settings:
     kernel: Kernel | None
     repair: bool
     formulation: str
+    sources: bool = False  # whether the weights of a source are wanted that is zero
 
 
 class Local:
@@ -76,7 +86,8 @@ class Local:
             local = local_problem(self.problem, halo.slab)
             self.cloud = cloud
             self.disc = discretize(
-                local, cloud, s.method, s.order, kernel, None, None, sources=False, depth=s.depth, part=self.part
+                local, cloud, s.method, s.order, kernel, None, None, sources=s.sources, depth=s.depth,
+                part=self.part,
             )
         missing = self.team.most(self._stencils_miss())
         if missing > 0.0 and self._grows():
@@ -84,6 +95,8 @@ class Local:
         with self.team.phase(halo.slab.number):
             self._check_together()
             self.run = Run(self.disc, self.disc.problem, "auto", True, s.repair, "loo")
+            self.widest = self.team.largest(_widest(self.disc.classes))
+        self._number()
         return 0.0
 
     def _grows(self) -> bool:
@@ -140,10 +153,26 @@ class Local:
                 'coefficients differ; use method="S"'
             )
 
+    # -- unknowns
+
+    def _number(self) -> None:
+        """Which of the local unknowns are the process's own, and the number of each among those of all processes."""
+        unknown = self.disc.unknowns
+        free = unknown >= 0
+        own = free & self.halo.own[:, None]
+        self.count = int(own.sum())
+        counts = self.team.gather(self.count)
+        self.first, self.size = sum(counts[: self.team.rank]), sum(counts)
+        number = np.full(unknown.shape, -1)
+        number[own] = self.first + np.arange(self.count)
+        number = self.halo.spread(number)
+        self.owned, self.place = np.zeros(int(free.sum()), bool), np.zeros(int(free.sum()), int)
+        self.owned[unknown[free]], self.place[unknown[free]] = own[free], number[free]
+
     # -- rows
 
-    def numbers(self, taylor: Any = None) -> Numbers:
-        nums = numbers(self.disc, self.disc.problem, taylor)
+    def numbers(self, disc: Discretization, taylor: Any = None) -> Numbers:
+        nums = numbers(disc, disc.problem, taylor)
         if nums.degenerate is not None:
             raise ValueError(
                 "pde: its highest derivatives lose their weight at some particles, and degenerate equations are not "
@@ -151,23 +180,81 @@ class Local:
             )
         return nums
 
-    def rows(self, taylor: Any = None) -> tuple[Numbers, list[Class], list[Row]]:
-        """The numbers and the rows of the own particles; on a wider halo where a repair looked beyond the first."""
+    def made(self, use: Use, start: Callable[[], Any] | None = None) -> list[Any]:
+        """``use`` of the rows of some own particles after others; on a wider halo where a repair looked beyond it.
+
+        start: expansions (n, F, K) on the present halo, about which a nonlinear problem is linearised.
+        """
         while True:
             first = self.run.health is None
+            taylor = None if start is None else start()
             with self.team.phase(self.halo.slab.number):
-                nums = self.numbers(taylor)
                 if first and self.settings.formulation == "auto":
-                    self._refuse_least_squares(nums)
-                classes, rows = self.run.local_rows(nums)
+                    self._refuse_least_squares(taylor)
+                found = [use(*piece) for piece in self._pieces(taylor)]
             missing = self.team.most(self._repairs_miss()) if first and self.settings.repair else 0.0
-            if missing <= 0.0 or not self._grows() or taylor is not None:
-                return nums, classes, rows
+            if missing <= 0.0 or not self._grows():
+                return found
             self._settle(MORE * (self.halo.reach + missing))
 
-    def _refuse_least_squares(self, nums: Numbers) -> None:
+    def only(self, classes: list[Class]) -> Discretization:
+        """The discretisation of the particles of some classes alone."""
+        own = np.zeros(len(self.halo), bool)
+        own[np.concatenate([np.zeros(0, int), *(cls.ids for cls in classes)])] = True
+        largest = lambda mine: {name: self.widest[name] for name in mine}  # noqa: E731
+        return replace(self.disc, classes=classes, part=replace(self.part, own=own, largest=largest))
+
+    def _pieces(self, taylor: Any) -> Iterator[tuple[Discretization, Numbers, list[Class], list[Row]]]:
+        """The own particles in pieces, the first time those with weak stencils repaired and last."""
+        run = self.run
+        repair = self.settings.repair and run.health is None and self.disc.scheme.method in ("S", "III")
+        poor: list[Class] = []
+        every: list[Class] = []
+        known = [] if run.health is None else [run.health.repaired]
+        told: list[health.Health] = []
+        for some in _gathered(self.disc.classes):
+            disc = self.only(some)
+            nums = self.numbers(disc, taylor)
+            classes, rows = all_rows(disc, nums)
+            if repair:
+                classes, rows, weak = health.parted(classes, rows)
+                poor += weak
+                if not classes:
+                    continue
+                disc = self.only(classes)
+            told.append(self._judged(health.examine(classes, rows), nums, rows))
+            every += classes
+            yield disc, nums, classes, rows
+        if poor:
+            disc = self.only(poor)
+            nums = self.numbers(disc, taylor)
+            classes, rows, found = health.repaired(disc, nums, *all_rows(disc, nums))
+            told.append(self._judged(found, nums, rows))
+            known.append(found.repaired)
+            every += classes
+            yield self.only(classes), nums, classes, rows
+        self.disc.classes = every
+        run.health = health.Health(
+            max((one.largest for one in told), default=1.0),
+            np.concatenate([np.zeros(0, int), *(one.weak for one in told)]),
+            np.concatenate([np.zeros(0, int), *known]),
+        )
+
+    def _judged(self, found: health.Health, nums: Numbers, rows: list[Row]) -> health.Health:
+        """What was found of a piece, unless its rows are not determined."""
+        self.run.health, before = found, self.run.health
+        self.run.judge(nums, rows)
+        self.run.health = before
+        return found
+
+    def _refuse_least_squares(self, taylor: Any) -> None:
         """Where information travels the least-squares form is right, of which the processes make none."""
-        if any(self.team.gather(information_travels(self.disc, nums))):
+        disc, ids = self.disc, self.disc.active
+        slots = None if taylor is None else slot_series(disc.rec, disc.traced.slots, taylor[ids], 0)
+        points = np.asarray(disc.cloud.points)[ids]
+        jac, _ = disc.traced.coefficients(points, 0, params=disc.problem.params, slots=slots)
+        leading: Any = SimpleNamespace(jac=jac)
+        if any(self.team.gather(information_travels(disc, leading))):
             raise ValueError(
                 'formulation: in this equation information travels (first order, or convection above diffusion), and '
                 'the least-squares form is not made for several processes; say formulation="loo" where diffusion '
@@ -198,6 +285,39 @@ class Local:
             nums = numbers(disc, disc.problem, taylor, everywhere=True)
             found = np.asarray(all_coefficients(disc, nums, values))
         return self.halo.spread(found)
+
+    def expanded(self, values: np.ndarray, taylor: Any) -> np.ndarray:
+        """The expansions (n, F, K) that the rows linearised at ``taylor`` give to values (n, F), held ones' too."""
+        with self.team.phase(self.halo.slab.number):
+            found = np.asarray(all_coefficients(self.disc, self.numbers(self.disc, taylor), values))
+        found = self.halo.spread(found)
+        with self.team.phase(self.halo.slab.number):
+            found = np.asarray(with_held_expansions(self.disc, found))
+        return self.halo.spread(found)
+
+
+def _gathered(classes: list[Class]) -> list[list[Class]]:
+    """The classes cut, and small ones put together, so that each piece has about AT_ONCE particles."""
+    pieces: list[list[Class]] = []
+    left = 0
+    for cls in classes:
+        parts = max(1, round(len(cls.ids) / AT_ONCE))
+        for ids, near in zip(np.array_split(cls.ids, parts), np.array_split(cls.neighbours, parts)):
+            if len(ids) > left:
+                pieces.append([])
+                left = AT_ONCE
+            pieces[-1].append(replace(cls, ids=ids, neighbours=near) if parts > 1 else cls)
+            left -= len(ids)
+    return pieces
+
+
+def _widest(classes: list[Class]) -> dict[Any, int]:
+    """The largest stencil of every kind of class."""
+    out: dict[Any, int] = {}
+    for cls in classes:
+        kind = health.kind_of(cls.scheme, cls.wide)
+        out[kind] = max(int((cls.neighbours >= 0).sum(axis=1).max()), out.get(kind, 0))
+    return out
 
 
 def _first_reach(mine: Slab, order: int) -> float:
