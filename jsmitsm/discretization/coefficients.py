@@ -72,7 +72,8 @@ def numbers(disc: Discretization, problem: Problem, taylor: Any = None, everywhe
 
 def conditions_of(disc: Discretization, problem: Problem) -> tuple[Any, Any, Any]:
     """The conditions' values (held, given, gamma; see Numbers) of another problem of the same form."""
-    groups = group_conditions(problem, with_corners(problem, disc.cloud), disc.rec.order, disc.traced.order)
+    cloud, whole = with_corners(problem, disc.cloud), disc.part is None
+    groups = group_conditions(problem, cloud, disc.rec.order, disc.traced.order, whole)
     other = replace(disc, groups=groups)
     held = _held_values(other)
     _, _, given = _own_numbers(other, held, None)

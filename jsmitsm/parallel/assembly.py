@@ -11,7 +11,7 @@ from jsmitsm.discretization.coefficients import Numbers, held_values
 from jsmitsm.discretization.layout import Class, Discretization
 from jsmitsm.discretization.leave_one_out import predictions, right_side
 from jsmitsm.parallel.local import Local
-from jsmitsm.parallel.system import Block, System
+from jsmitsm.parallel.system import Block, System, distributed
 from jsmitsm.parallel.team import Team
 from jsmitsm.particle.moments import Row
 
@@ -40,7 +40,7 @@ def assembled(
     found.clear()
     rec = local.disc.rec
     elliptic = rec.fields == 1 and set(rec.orders) == {2}
-    return System(us, local.count, blocks, solver, elliptic), right
+    return System(us, distributed(us, local.count, blocks), solver, elliptic), right
 
 
 def _block(

@@ -132,7 +132,7 @@ def read(
             slab = _mapped(us, points, groups, normals, names)
         else:
             slab = slab_of(us, from_mesh(os.fspath(points), tags))
-    return ParallelCloud(_placed(us, slab))
+    return ParallelCloud(placed(us, slab))
 
 
 def _mapped(us: Team, points: Any, groups: Any, normals: Any, names: Any) -> Slab:
@@ -170,7 +170,7 @@ def _own_slab(us: Team, count: int) -> slice:
     return slice(us.rank * count // us.size, (us.rank + 1) * count // us.size)
 
 
-def _placed(us: Team, slab: Slab) -> Slab:
+def placed(us: Team, slab: Slab) -> Slab:
     """With the place of every particle in its group."""
     counts = np.stack(us.gather(np.bincount(slab.group, minlength=len(slab.names))))
     before = counts[: us.rank].sum(axis=0)

@@ -14,6 +14,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.cloud.neighbours import EVEN_SAMPLE, Stencils, is_even, kept_distances, nearest
 from jsmitsm.discretization import health
 from jsmitsm.discretization.coefficients import Numbers, numbers, slot_series
@@ -83,7 +84,7 @@ class Local:
             self.part = Part(halo.own, even, self._spacing(), self._sample(), self.team.largest, self.team.total)
             cloud = halo.slab.cloud()
             kernel = s.kernel and local_kernel(s.kernel, halo.slab)
-            local = local_problem(self.problem, halo.slab)
+            local = self._localised(halo.slab, cloud)
             self.cloud = cloud
             self.disc = discretize(
                 local, cloud, s.method, s.order, kernel, None, None, sources=s.sources, depth=s.depth,
@@ -98,6 +99,17 @@ class Local:
             self.widest = self.team.largest(_widest(self.disc.classes))
         self._number()
         return 0.0
+
+    def _localised(self, slab: Slab, cloud: Cloud) -> Problem:
+        """The problem on the local particles."""
+        return local_problem(self.problem, slab)
+
+    def widen(self, missing: float) -> bool:
+        """Begin anew on a halo that reaches farther by what is missing; False where that is not needed."""
+        if missing <= 0.0 or not self._grows():
+            return False
+        self._settle(MORE * (self.halo.reach + missing))
+        return True
 
     def _grows(self) -> bool:
         return self.team.total(int(len(self.halo) < self.mine.count)) > 0
@@ -193,9 +205,8 @@ class Local:
                     self._refuse_least_squares(taylor)
                 found = [use(*piece) for piece in self._pieces(taylor)]
             missing = self.team.most(self._repairs_miss()) if first and self.settings.repair else 0.0
-            if missing <= 0.0 or not self._grows():
+            if not self.widen(missing):
                 return found
-            self._settle(MORE * (self.halo.reach + missing))
 
     def only(self, classes: list[Class]) -> Discretization:
         """The discretisation of the particles of some classes alone."""
@@ -267,7 +278,10 @@ class Local:
         ids = np.unique(np.concatenate([health.repaired, health.weak])).astype(int) if health else np.zeros(0, int)
         if not len(ids):
             return -1.0
-        widest = max(int((c.neighbours >= 0).sum(axis=1).max()) for c in self.disc.classes)
+        return self.pool_misses(ids, max(int((c.neighbours >= 0).sum(axis=1).max()) for c in self.disc.classes))
+
+    def pool_misses(self, ids: np.ndarray, widest: int) -> float:
+        """By how much the halo falls short of what a repair of stencils of this size looks at."""
         count = POOL * widest
         points = self.halo.slab.points
         if len(points) < min(count, self.mine.count):

@@ -120,7 +120,15 @@ def recipe(local: Local) -> Recipe:
 def check_asked(
     problem: Any, cloud: Any, method: Any, order: Any, depth: Any, kernel: Any, form: Any, solver: Any
 ) -> None:
-    """Refuse in words what several processes do not make, and bad input."""
+    """Refuse bad input, and in words what several processes do not make."""
+    refuse_others(problem, cloud, method, form, solver)
+    probe = cloud.slab.cloud() if isinstance(cloud, ParallelCloud) else cloud
+    given = None if kernel is None or np.ndim(kernel.h) else kernel
+    check(problem, probe, method, order, given, None, "auto", "auto", depth=depth)
+
+
+def refuse_others(problem: Any, cloud: Any, method: Any, form: Any, solver: Any) -> None:
+    """Refuse by name what several processes do not make."""
     if not isinstance(problem, Problem):
         raise ValueError(f"problem: expected a js.Problem, got {type(problem).__name__}")
     if isinstance(problem.pde, PerRegion):
@@ -133,6 +141,3 @@ def check_asked(
                              f"processes{did_you_mean(value, known)}")  # fmt: skip
     if getattr(cloud, "dim", 2) == 1:
         raise ValueError("cloud: one in 1D has no need of several processes; use js.solve")
-    probe = cloud.slab.cloud() if isinstance(cloud, ParallelCloud) else cloud
-    given = None if kernel is None or np.ndim(kernel.h) else kernel
-    check(problem, probe, method, order, given, None, "auto", "auto", depth=depth)

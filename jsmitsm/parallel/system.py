@@ -58,19 +58,25 @@ def distributed(team: Team, n: int, blocks: list[Block]) -> Any:
     return matrix
 
 
+def product(matrix: Any, x: np.ndarray) -> np.ndarray:
+    """The own part (n,) of A x, from that of x."""
+    vector, out = matrix.createVecRight(), matrix.createVecLeft()
+    vector.setArray(x)
+    matrix.mult(vector, out)
+    return out.getArray().copy()
+
+
 class System:
     """The rows of all processes, unknowns numbered over all.
 
     info: the solver, the iterations of the last solve (to its first guess, and in all), and its backward error.
     """
 
-    def __init__(self, team: Team, n: int, blocks: list[Block], solver: str, elliptic: bool):
+    def __init__(self, team: Team, matrix: Any, solver: str, elliptic: bool):
         self.team, self.elliptic = team, elliptic
         self.petsc = engine("petsc4py.PETSc")
-        self.n = n
-        counts = team.gather(n)
-        self.first, self.size = sum(counts[: team.rank]), sum(counts)
-        self.matrix = distributed(team, n, blocks)
+        self.n, self.size = matrix.getLocalSize()[0], matrix.getSize()[0]
+        self.matrix = matrix
         self.turned: Any = None
         self.ways = ("hypre", "gamg", "mumps") if elliptic else ("mumps",)
         if solver != "auto":
@@ -99,10 +105,7 @@ class System:
 
     def times(self, x: np.ndarray) -> np.ndarray:
         """The own part (n,) of A x."""
-        vector, out = self.matrix.createVecLeft(), self.matrix.createVecLeft()
-        vector.setArray(x)
-        self.matrix.mult(vector, out)
-        return out.getArray().copy()
+        return product(self.matrix, x)
 
     def _refined(self, way: str, matrix: Any, b: np.ndarray, transpose: bool) -> tuple[np.ndarray, float, list[int]]:
         """The solution of one solver, its backward error, and the iterations of the first solve and each correction."""
