@@ -36,7 +36,7 @@ from jsmitsm.solution.run import Run
 
 # The first halo reaches so many times the radius of this many nearest particles for every free coefficient of the fit.
 # What repairs look at is ten stencils at the most.
-FIRST, POOL = 2.2, 10
+FIRST, POOL = 1.6, 10
 # A halo that falls short is widened to this more than what was missed.
 MORE = 1.05
 # Particles whose rows are made at a time: enough to fill a program, few enough not to be seen beside the matrix.
@@ -66,7 +66,7 @@ class Local:
         self.team, self.settings, self.mine = team, settings, mine
         self.problem = problem
         self.boxes = boxes_of(team, mine)
-        self._settle(team.most(_first_reach(mine, settings.order)))
+        self._settle(team.most(first_reach(mine, settings.order)))
 
     def _settle(self, reach: float) -> None:
         """Discretise on a halo of this reach, or of a larger one where the stencils need it."""
@@ -334,7 +334,7 @@ def _widest(classes: list[Class]) -> dict[Any, int]:
     return out
 
 
-def _first_reach(mine: Slab, order: int) -> float:
+def first_reach(mine: Slab, order: int) -> float:
     """The reach of a first halo: that of a stencil, and of those next to it."""
     size = {2: (order + 1) * 4, 3: (order + 1) ** 2 * 3}[mine.dim]
     points = mine.points

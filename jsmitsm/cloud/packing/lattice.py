@@ -90,10 +90,11 @@ def _disorder(index: np.ndarray, seed: int) -> np.ndarray:
         z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
         return z ^ (z >> np.uint64(31))
 
-    state = mixed(np.full(len(index), seed, np.uint64) + np.uint64(0x9E3779B97F4A7C15))
+    golden = 0x9E3779B97F4A7C15
+    state = mixed(np.full(len(index), (seed + golden) % 2**64, np.uint64))
     for column in index.T:
-        state = mixed(state + column.astype(np.int64).view(np.uint64) + np.uint64(0x9E3779B97F4A7C15))
-    bits = [mixed(state + np.uint64(k + 1) * np.uint64(0x9E3779B97F4A7C15)) for k in range(index.shape[1])]
+        state = mixed(state + column.astype(np.int64).view(np.uint64) + np.uint64(golden))
+    bits = [mixed(state + np.uint64((k + 1) * golden % 2**64)) for k in range(index.shape[1])]
     return np.stack([(b >> np.uint64(11)).astype(float) for b in bits], axis=1) * 2.0**-52 - 1.0
 
 
