@@ -12,7 +12,7 @@ from jsmitsm.discretization.layout import Class, Discretization
 from jsmitsm.discretization.leave_one_out import predictions, right_side
 from jsmitsm.parallel.local import Local
 from jsmitsm.parallel.system import Block, System, distributed
-from jsmitsm.parallel.team import Team
+from jsmitsm.parallel.team import Team, give_back
 from jsmitsm.particle.moments import Row
 
 # What rows were made of: the discretisation of some particles, its numbers, classes and rows.
@@ -40,7 +40,9 @@ def assembled(
     found.clear()
     rec = local.disc.rec
     elliptic = rec.fields == 1 and set(rec.orders) == {2}
-    return System(us, distributed(us, local.count, blocks), solver, elliptic), right
+    matrix = distributed(us, local.count, blocks)
+    give_back()
+    return System(us, matrix, solver, elliptic), right
 
 
 def _block(

@@ -29,7 +29,7 @@ from jsmitsm.equation.conditions import refuse_counts
 from jsmitsm.equation.problem import Problem
 from jsmitsm.parallel.distributed import Slab
 from jsmitsm.parallel.halo import Halo, boxes_of
-from jsmitsm.parallel.team import Team
+from jsmitsm.parallel.team import Team, give_back
 from jsmitsm.particle.kernels import Kernel
 from jsmitsm.particle.moments import Row
 from jsmitsm.solution.run import Run
@@ -40,7 +40,7 @@ FIRST, POOL = 1.6, 10
 # A halo that falls short is widened to this more than what was missed.
 MORE = 1.05
 # Particles whose rows are made at a time: enough to fill a program, few enough not to be seen beside the matrix.
-AT_ONCE = 8192
+AT_ONCE = 4096
 
 # What is made of the rows of some particles: (discretisation of these alone, numbers, classes, rows) -> anything.
 Use = Callable[[Discretization, Numbers, list[Class], list[Row]], Any]
@@ -98,6 +98,7 @@ class Local:
             self.run = Run(self.disc, self.disc.problem, "auto", True, s.repair, "loo")
             self.widest = self.team.largest(_widest(self.disc.classes))
         self._number()
+        give_back()
         return 0.0
 
     def _localised(self, slab: Slab, cloud: Cloud) -> Problem:
@@ -137,8 +138,9 @@ class Local:
     def _stencils_miss(self) -> float:
         """By how much the halo falls short of the stencils of own particles, and of those that tell jumps from them."""
         near, radius = np.asarray(self.disc.stencils.indices), self.disc.stencils.radius
-        ids = np.unique(near[self.halo.ids])
-        ids = ids[ids >= 0]
+        seen = np.zeros(len(near) + 1, bool)  # -1 stands for none
+        seen[near[self.halo.ids]] = True
+        ids = np.flatnonzero(seen[:-1])
         if radius is None:
             return -1.0
         return self.halo.short_by(np.broadcast_to(np.asarray(radius), len(near))[ids], ids)
@@ -236,6 +238,10 @@ class Local:
             told.append(self._judged(health.examine(classes, rows), nums, rows))
             every += classes
             yield disc, nums, classes, rows
+            for cls in classes:  # what was kept for a next time is as large as the rows
+                cls.kept.clear()
+            del nums, classes, rows
+            give_back()
         if poor:
             disc = self.only(poor)
             nums = self.numbers(disc, taylor)

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jsmitsm.parallel.team import Team, engine
+from jsmitsm.parallel.team import Team, engine, give_back
 from jsmitsm.runtime.errors import SolveError
 
 # Solvers by name. Hypre is tuned for second-order operators on scattered particles, see docs/parallel.md.
@@ -54,6 +54,8 @@ def distributed(team: Team, n: int, blocks: list[Block]) -> Any:
         rows, entries = blocks.pop()
         places = (entries.indptr.astype(index), entries.indices.astype(index), entries.data)
         matrix.setValuesIJV(*places, addv=True, rowmap=(first + rows).astype(index))
+        del rows, entries, places
+        give_back()
     matrix.assemble()
     return matrix
 
