@@ -260,7 +260,7 @@ def sorted_classes(disc: Discretization, ids: np.ndarray, stencils: Stencils) ->
     for k, width in enumerate(used):
         some = ids[wide == k]
         if len(some):
-            classes += split(disc, Class(some, near[some][:, :width], disc.scheme, bool(k)))
+            classes += split(disc, Class(some, near[some, :width], disc.scheme, bool(k)))
     return classes
 
 

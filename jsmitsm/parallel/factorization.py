@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from copy import copy
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -33,8 +32,8 @@ class ParallelFactorization:
     values in the conditions change, and makes anew what else does.
     """
 
-    def __init__(self, slab: Any, local: Local, solver: str):
-        self._slab, self._local, self._solver = slab, local, solver
+    def __init__(self, local: Local, solver: str):
+        self._local, self._solver = local, solver
         self._pieces: list[Piece] = []
         self.system, _ = assembled(local.team, local, solver, kept=self._pieces)
 
@@ -84,10 +83,10 @@ class ParallelFactorization:
                     right[_places(local, some)] = np.asarray(right_side(some, nums, classes, rows))
         if not all(us.gather(same)):
             made = Local(us, problem, old.mine, settings)
-            return ParallelFactorization(self._slab, made, self._solver).solve(problem)
+            return ParallelFactorization(made, self._solver).solve(problem)
         x = self.system.solve(right)
         seconds = {"total": time.perf_counter() - began}
-        return ParallelSolution(us, local, recipe(local), spread(local, x), self.system, self._slab, seconds)
+        return ParallelSolution(us, local, recipe(local), spread(local, x), self.system, seconds)
 
     def __repr__(self) -> str:
         return f"ParallelFactorization({self.system.size} unknowns, {self._local.count} of them here)"
@@ -137,10 +136,9 @@ def factorize(
     us = team()
     with us.phase():
         check_asked(problem, cloud, method, order, depth, kernel, formulation, solver)
-    slab = slab_of(us, cloud)
-    repair = kernel is None
-    local = Local(us, problem, bisected(us, slab), Settings(method, order, depth, kernel, repair, formulation, True))
+    mine, repair = bisected(us, slab_of(us, cloud)), kernel is None
+    local = Local(us, problem, mine, Settings(method, order, depth, kernel, repair, formulation, True))
     with us.phase():
         if not local.disc.linear:
             raise ValueError("problem: it is nonlinear, so its matrix changes in every step; use jp.solve")
-    return ParallelFactorization(slab, local, solver)
+    return ParallelFactorization(local, solver)

@@ -125,7 +125,7 @@ def eigen(
     made = time.perf_counter()
     values, vectors, residuals = _found(us, a, c, count, float(near), 10.0 ** -(order / 2 + 1))
     u = np.zeros((*local.disc.held[local.halo.ids].shape, len(values)), vectors.dtype)
-    u[~local.disc.held[local.halo.ids]] = _normalised(us, vectors, len(slab), local.first)
+    u[~local.disc.held[local.halo.ids]] = _normalised(us, vectors, slab.count, local.first)
     end = time.perf_counter()
     stats = {
         "particles": local.mine.count, "own": len(local.halo.ids), "unknowns": local.size, "reach": local.halo.reach,

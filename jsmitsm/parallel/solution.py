@@ -34,9 +34,9 @@ class ParallelSolution:
         Seconds per phase, sizes, iterations, what was repaired (numbers in the whole cloud).
     """
 
-    def __init__(self, us: Team, local: Any, recipe: Recipe, values: Any, system: Any, slab: Any,
+    def __init__(self, us: Team, local: Any, recipe: Recipe, values: Any, system: Any,
                  seconds: dict[str, float]):  # fmt: skip
-        self._team, self._local, self.system, self._slab = us, local, system, slab
+        self._team, self._local, self.system = us, local, system
         self._values, self._recipe, self._taylor = values, recipe, None
         self._linearised: Any = None  # the expansions at which a nonlinear problem was linearised last
         self.iterations = 1

@@ -88,20 +88,21 @@ def solve(
         check_asked(problem, cloud, method, order, depth, kernel, formulation, solver)
         slab = slab_of(us, cloud)
     parted = bisected(us, slab)
+    del slab
     with us.phase():
         if not len(parted):
             raise ValueError(f"cloud: no particles for process {us.rank} of {us.size}; start fewer processes")
     repair = kernel is None
     local = Local(us, problem, parted, Settings(method, order, depth, kernel, repair, formulation))
-    return solved(us, local, slab, solver, u0, began)
+    return solved(us, local, solver, u0, began)
 
 
-def solved(us: Team, local: Local, slab: Any, solver: str, u0: Any, began: float) -> ParallelSolution:
+def solved(us: Team, local: Local, solver: str, u0: Any, began: float) -> ParallelSolution:
     """Rows, global system, values; of a nonlinear problem the last ones of Newton's method."""
     if not local.disc.linear:
         found = newton(us, local, solver, u0)
         seconds = {"local": found.seconds, "total": time.perf_counter() - began}
-        sol = ParallelSolution(us, local, recipe(local), found.values, found.system, slab, seconds)
+        sol = ParallelSolution(us, local, recipe(local), found.values, found.system, seconds)
         sol._linearised = found.taylor
         sol.iterations, sol.stats["changes"] = found.steps, found.changes
         return sol
@@ -109,7 +110,7 @@ def solved(us: Team, local: Local, slab: Any, solver: str, u0: Any, began: float
     put = time.perf_counter()
     x = system.solve(b)
     seconds = {"local": put - began, "solve": time.perf_counter() - put, "total": time.perf_counter() - began}
-    return ParallelSolution(us, local, recipe(local), spread(local, x), system, slab, seconds)
+    return ParallelSolution(us, local, recipe(local), spread(local, x), system, seconds)
 
 
 def recipe(local: Local) -> Recipe:
