@@ -252,8 +252,7 @@ def sorted_classes(disc: Discretization, ids: np.ndarray, stencils: Stencils) ->
         wide = counts > 1.25 * narrow
         widest = int(counts[~wide].max(initial=1)), near.shape[1]
         if disc.part is not None:
-            found = disc.part.largest(dict(enumerate(widest)))
-            widest = found[0], found[1]
+            widest = tuple(disc.part.largest(dict(enumerate(widest))).values())
         used = [_width_at_hand(disc.scheme, rounded_width(width)) for width in widest]
         near = np.pad(near, ((0, 0), (0, max(0, max(used) - near.shape[1]))), constant_values=-1)
     classes = []

@@ -7,12 +7,12 @@ Imports show and what stands before it.
 
 from jsmitsm.parallel.distributed import ParallelCloud, read
 from jsmitsm.parallel.estimate import error_estimate
-from jsmitsm.parallel.evolution import ParallelEvolution, evolve
 from jsmitsm.parallel.factorization import ParallelFactorization, factorize
 from jsmitsm.parallel.files import save
 from jsmitsm.parallel.filling import cloud_from
 from jsmitsm.parallel.gradient import value_and_grad
-from jsmitsm.parallel.modes import ParallelModes, eigen
+from jsmitsm.parallel.pencil.evolution import ParallelEvolution, evolve
+from jsmitsm.parallel.pencil.modes import ParallelModes, eigen
 from jsmitsm.parallel.solution import ParallelSolution, evaluate, norm
 from jsmitsm.parallel.solving import solve
 

@@ -16,7 +16,8 @@ from jsmitsm.discretization.leave_one_out import right_side
 from jsmitsm.equation.problem import Problem
 from jsmitsm.parallel.assembly import Piece, assembled, spread
 from jsmitsm.parallel.distributed import ParallelCloud, bisected, slab_of
-from jsmitsm.parallel.local import Local, Settings, local_kernel, local_problem
+from jsmitsm.parallel.local import Local, Settings
+from jsmitsm.parallel.shares import local_kernel, local_problem
 from jsmitsm.parallel.solution import ParallelSolution
 from jsmitsm.parallel.solving import check_asked, recipe
 from jsmitsm.parallel.team import team

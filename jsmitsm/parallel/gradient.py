@@ -17,7 +17,8 @@ from jsmitsm.discretization.leave_one_out import matrix, right_side, with_held
 from jsmitsm.discretization.rows import all_rows
 from jsmitsm.equation.problem import Problem
 from jsmitsm.parallel.distributed import ParallelCloud
-from jsmitsm.parallel.local import Local, local_kernel, local_problem
+from jsmitsm.parallel.local import Local
+from jsmitsm.parallel.shares import local_kernel, local_problem
 from jsmitsm.parallel.solving import solve
 
 WRT = ("params", "points")

@@ -17,8 +17,9 @@ from jsmitsm.evolution.steps import dense_output
 from jsmitsm.evolution.steps.stepping import Stepper
 from jsmitsm.evolution.steps.tableaux import EULER, KENCARP4
 from jsmitsm.parallel.distributed import ParallelCloud, Slab, bisected, slab_of
-from jsmitsm.parallel.local import Local, Settings, local_problem
-from jsmitsm.parallel.pencil import own_rows, pencil_of_part
+from jsmitsm.parallel.local import Local, Settings
+from jsmitsm.parallel.pencil.assemble import own_rows, pencil_of_part
+from jsmitsm.parallel.shares import local_problem
 from jsmitsm.parallel.solving import refuse_others
 from jsmitsm.parallel.system import System, product
 from jsmitsm.parallel.team import Team, team

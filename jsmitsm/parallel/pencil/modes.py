@@ -14,7 +14,7 @@ from jsmitsm.modes.eigen import check_question, refuse_data
 from jsmitsm.modes.question import masses
 from jsmitsm.parallel.distributed import ParallelCloud, bisected, slab_of
 from jsmitsm.parallel.local import Local, Settings
-from jsmitsm.parallel.pencil import own_rows, pencil_of_part
+from jsmitsm.parallel.pencil.assemble import own_rows, pencil_of_part
 from jsmitsm.parallel.solving import check_asked
 from jsmitsm.parallel.system import product
 from jsmitsm.parallel.team import Team, engine, team
