@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 from dataclasses import dataclass, field, replace
+from operator import itemgetter
 from typing import Any
 
 import jax
@@ -252,7 +253,7 @@ def sorted_classes(disc: Discretization, ids: np.ndarray, stencils: Stencils) ->
         wide = counts > 1.25 * narrow
         widest = int(counts[~wide].max(initial=1)), near.shape[1]
         if disc.part is not None:
-            widest = tuple(disc.part.largest(dict(enumerate(widest))).values())
+            widest = itemgetter(0, 1)(disc.part.largest(dict(enumerate(widest))))
         used = [_width_at_hand(disc.scheme, rounded_width(width)) for width in widest]
         near = np.pad(near, ((0, 0), (0, max(0, max(used) - near.shape[1]))), constant_values=-1)
     classes = []

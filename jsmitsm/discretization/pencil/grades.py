@@ -91,7 +91,7 @@ class Grading:
 
 def _sizes(disc: Discretization, parts: list[Part]) -> dict[Any, int]:
     """The largest stencils of every kind of class, and of its sources; in a part of a cloud those of the whole."""
-    found = {}
+    found: dict[Any, int] = {}
     for part in parts:
         kind = kind_of(part.cls.scheme, part.cls.wide)
         for name, near in (("near", part.cls.neighbours), ("far", part.far)):
