@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 from dataclasses import dataclass, field, replace
-from operator import itemgetter
 from typing import Any
 
 import jax
@@ -251,9 +250,9 @@ def sorted_classes(disc: Discretization, ids: np.ndarray, stencils: Stencils) ->
         counts = np.max(np.where(near[ids] >= 0, np.arange(near.shape[1]), 0), axis=1, initial=0) + 1
         narrow = _most_need(counts, disc.part)
         wide = counts > 1.25 * narrow
-        widest = int(counts[~wide].max(initial=1)), near.shape[1]
+        widest = [int(counts[~wide].max(initial=1)), int(near.shape[1])]
         if disc.part is not None:
-            widest = itemgetter(0, 1)(disc.part.largest(dict(enumerate(widest))))
+            widest = list(disc.part.largest(dict(enumerate(widest))).values())
         used = [_width_at_hand(disc.scheme, rounded_width(width)) for width in widest]
         near = np.pad(near, ((0, 0), (0, max(0, max(used) - near.shape[1]))), constant_values=-1)
     classes = []
