@@ -1,13 +1,15 @@
 """Eigenvalues against known ones, finite elements beside them: ``python -m benchmarks.modes [names] [--quick]``.
 
-Names: disk, free, plate, ball, elastic, mass, spectra, flow; all without any. Each writes its part of
+Names: disk, free, plate, buckling, ball, elastic, beam, mass, spectra, flow; all without any. Each writes its part of
 benchmarks/data/modes.json.
 
 disk, free: -laplacian(u) = lambda u on the unit disk, u or its normal derivative zero: Bessel's zeros. plate: the
-clamped square, against sqrt(lambda) = 35.98519. ball: the unit ball, pi^2. elastic: a square between rollers,
-whose waves are known. mass: div(a grad u) with mass 1 + x y, against order 8 on 2209 particles. spectra: the
-largest real part of the eigenvalues of B^-1 A, of L = laplacian, on clouds of about 400 particles; none may be
-above 1e-6. flow: the same of Stokes' equations, with div u = 0 and with an equation for the pressure.
+clamped square, against sqrt(lambda) = 35.98519. buckling: the same under pressure from all sides, 52.34469. ball: the
+unit ball, pi^2. elastic: a square between rollers, whose waves are known. beam: a strip of length 2 and height 0.4 with
+free faces, held across at its ends, against the equations of Rayleigh and Lamb (Graff, Wave Motion in Elastic Solids,
+1975, section 8.1). mass: div(a grad u) with mass 1 + x y, against order 8 on 2209 particles. spectra: the largest real
+part of the eigenvalues of B^-1 A, of L = laplacian, on clouds of about 400 particles; none may be above 1e-6. flow: the
+same of Stokes' equations, with div u = 0 and with an equation for the pressure.
 Elements: scikit-fem's P2 on triangles with curved sides (isoparametric) on the disk.
 """
 
@@ -117,16 +119,59 @@ def ball(quick: bool) -> Iterator[dict[str, Any]]:
     yield from solved("ball", js.Problem(minus_laplacian, {"boundary": HELD}), cloud, exact, (2, 4, 6))
 
 
+def buckling(quick: bool) -> Iterator[dict[str, Any]]:
+    problem = js.Problem(lambda u, x: js.laplacian(js.laplacian(u))(x), dict.fromkeys(SIDES, [HELD, FREE]))
+    for n in (13,) if quick else (13, 17):
+        cloud = js.rectangle((0, 0), (1, 1), (n, n))
+        yield from solved("buckling plate", problem, cloud, np.array([52.34469]), (4, 6), mass=minus_laplacian)
+
+
+# Plane stress, nu = 0.3, Young's modulus 1.
+MU, LAME = 0.5 / 1.3, 0.3 / (1 - 0.3**2)
+
+
+def elasticity(u: Any, x: Any) -> Any:
+    h = [js.hessian(u[k])(x) for k in range(2)]
+    spread = jnp.stack([h[0][0, 0] + h[1][0, 1], h[0][0, 1] + h[1][1, 1]])
+    return -MU * jnp.stack([jnp.trace(h[0]), jnp.trace(h[1])]) - (LAME + MU) * spread
+
+
+def beam(quick: bool) -> Iterator[dict[str, Any]]:
+    """No traction on the faces; at the ends no displacement across and no traction along."""
+    length, half = 2.0, 0.2
+
+    def traction(u: Any, x: Any, n: Any) -> Any:
+        g = js.grad(u)(x)
+        return LAME * jnp.trace(g) * n + MU * (g + g.T) @ n
+
+    ends = [js.dirichlet(0.0, field=1), js.condition(lambda u, x, n: traction(u, x, n)[0])]
+    bcs: Any = {**dict.fromkeys(SIDES[:2], ends), **dict.fromkeys(SIDES[2:], js.condition(traction))}
+    values = [0.0]
+    for number in np.pi / length * np.arange(1, 5):
+        values += [v for bends in (True, False) for v in waves_of_a_strip(float(number), half, bends, 10.0)]
+    exact = np.sort(values)[:6]
+    cloud = js.rectangle((0, -half), (length, half), (31, 7) if quick else (41, 9), jitter=0.1)
+    yield from solved("elastic beam", js.Problem(elasticity, bcs, fields=2), cloud, exact, (4, 6, 8))
+
+
+def waves_of_a_strip(k: float, half: float, bends: bool, most: float) -> list[float]:
+    """Squares of frequencies below ``most`` of waves with the number k along a strip with free faces, of density 1."""
+    from scipy.optimize import brentq
+
+    def misfit(square: float) -> float:
+        p, q = (np.sqrt(complex(square / c - k * k)) for c in (LAME + 2 * MU, MU))
+        one, two = (np.cos(p * half), np.sin(q * half) / q), (np.sin(p * half) / p, np.cos(q * half))
+        own, other = (two, one) if bends else (one, two)
+        factor = q * q if bends else p * p
+        return float(((q * q - k * k) ** 2 * own[0] * own[1] + 4 * k * k * factor * other[0] * other[1]).real)
+
+    places = np.linspace(1e-4, most, 4000)
+    sign = np.sign([misfit(s) for s in places])
+    return [float(brentq(misfit, places[i], places[i + 1], xtol=1e-14)) for i in np.flatnonzero(np.diff(sign))]
+
+
 def elastic(quick: bool) -> Iterator[dict[str, Any]]:
-    """Plane stress, nu = 0.3: no normal displacement and no shear on the sides."""
-    nu = 0.3
-    mu, lame = 0.5 / (1 + nu), nu / (1 - nu**2)
-
-    def operator(u: Any, x: Any) -> Any:
-        h = [js.hessian(u[k])(x) for k in range(2)]
-        spread = jnp.stack([h[0][0, 0] + h[1][0, 1], h[0][0, 1] + h[1][1, 1]])
-        return -mu * jnp.stack([jnp.trace(h[0]), jnp.trace(h[1])]) - (lame + mu) * spread
-
+    """No normal displacement and no shear on the sides."""
     def shear(u: Any, x: Any, n: Any) -> Any:
         return js.grad(u[0])(x)[1] + js.grad(u[1])(x)[0]
 
@@ -134,10 +179,10 @@ def elastic(quick: bool) -> Iterator[dict[str, Any]]:
                 for side in pair}  # fmt: skip
     waves = [(m * m + n * n, m * n > 0) for m in range(6) for n in range(6) if m + n]
     exact = np.sort(
-        np.pi**2 * np.array([(lame + 2 * mu) * k for k, _ in waves] + [mu * k for k, both in waves if both])
+        np.pi**2 * np.array([(LAME + 2 * MU) * k for k, _ in waves] + [MU * k for k, both in waves if both])
     )
     cloud = js.rectangle((0, 0), (1, 1), (16, 16) if quick else (26, 26), jitter=0.2)
-    yield from solved("elastic square", js.Problem(operator, bcs, fields=2), cloud, exact[:6], (4, 6, 8))
+    yield from solved("elastic square", js.Problem(elasticity, bcs, fields=2), cloud, exact[:6], (4, 6, 8))
 
 
 def weighted(quick: bool) -> Iterator[dict[str, Any]]:
@@ -240,7 +285,8 @@ def flow_spectrum(kind: str, what: str, cloud: js.Cloud, problem: js.Problem, or
 
 
 CASES = {
-    "disk": on_disk, "free": free_disk, "plate": plate, "ball": ball, "elastic": elastic, "mass": weighted,
+    "disk": on_disk, "free": free_disk, "plate": plate, "buckling": buckling, "ball": ball, "elastic": elastic,
+    "beam": beam, "mass": weighted,
     "spectra": spectra, "flow": flows,
 }  # fmt: skip
 

@@ -172,6 +172,8 @@ def main():
                 rows.append(row)
                 print(row, flush=True)
         for factor in (1, 2):
+            if any(r["case"] == "elements" and r["spacing"] == spacing / factor for r in rows):
+                continue
             fine = cloud if factor == 1 else disk(spacing / factor)
             for degree, made in ((2, elements(fine, 10.0)), (4, curved_elements(spacing / factor, 10.0))):
                 rows.append({"case": "elements", "k": 10.0, "spacing": spacing / factor, "order": degree, **made})

@@ -121,6 +121,7 @@ def test_traction_and_slip_with_respect_to_normals():
 
     def f(t):
         kernel = js.Gaussian(h=t["h"], d=10.0)
-        return jnp.sum(weights * js.solve(elastic(t), turned(cloud, t), order=2, kernel=kernel, stencils=near).u ** 2)
+        sol = js.solve(elastic(t), turned(cloud, t), order=2, kernel=kernel, stencils=near, depth=0)
+        return jnp.sum(weights * sol.u**2)
 
     check(f, theta, ("modulus", "tilt"))

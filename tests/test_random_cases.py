@@ -8,7 +8,7 @@ import pytest
 
 from benchmarks.random_cases import sweep
 from benchmarks.random_cases.cases import DIMS, MEMBERS, case
-from benchmarks.random_cases.judging import KINDS, attempt, error_of, judged
+from benchmarks.random_cases.judging import KINDS, WRONG, another, attempt, error_of, judged
 from benchmarks.random_cases.operators import OPERATORS
 
 
@@ -45,7 +45,22 @@ def test_what_is_wrong_and_what_is_said():
     kind = lambda error, said: judged({"error": error, **said})["kind"]
     assert kind(0.2, quiet) == "silently wrong" and kind(0.2, loud) == "wrong and flagged"
     assert kind(np.nan, quiet) == "silently wrong"
+    assert kind(0.2, {**quiet, "another": True}) == "another solution"
+    assert kind(0.2, {**loud, "another": True}) == "wrong and flagged"
+    assert kind(1e-3, {**quiet, "another": True}) == "accurate"
     assert kind(0.05, quiet) == kind(0.05, loud) == "between"
     assert kind(1e-3, quiet) == "accurate" and kind(1e-3, loud) == "right, yet flagged"
     one = case(0, 0)
     assert error_of(one, one.exact) == 0.0 and error_of(one, 1.5 * one.exact) == pytest.approx(0.5)
+
+
+def test_another_solution_of_the_same_equations_is_told_from_a_wrong_one():
+    """Burgers' equation with a source, found at a solution that its own start does not lead to."""
+    one = case(60611, 453)
+    sol = one.solve()
+    assert error_of(one, sol.u) > WRONG and not sol.flags
+    assert another(one, sol)
+    its_own = one.solve(u0=one.exact)
+    assert not another(one, its_own)
+    linear = next(made for made in (case(0, k) for k in range(0, 4000, MEMBERS)) if made.kind == "linear")
+    assert not another(linear, sol)

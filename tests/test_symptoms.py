@@ -1,5 +1,6 @@
 """Every flag names its place in the documentation, and the place is there."""
 
+import inspect
 import re
 from pathlib import Path
 
@@ -62,7 +63,17 @@ REFUSED = [
     (lambda: js.Cloud([0.0, 1.0], {"interior": [0, 1]}), "clouds"),
     (lambda: js.from_polygon([(0, 0), (1, 0), (0, 1)], 2.0), "symptoms#coarse"),
     (lambda: js.Gaussian(-1.0, 2.0), "choosing"),
-    (lambda: js.dirichlet("a"), "symptoms#errors"),
+    (lambda: js.dirichlet("a"), "problems"),
+    (lambda: js.constraint(3), "problems"),
+    (lambda: js.point_source("here"), "problems"),
+    (lambda: js.interface(), "problems"),
+    (lambda: js.sdf.circle((0.0, 0.0), -1.0), "clouds"),
+    (lambda: js.sdf.circle((0.0, 0.0), 1.0)(jnp.zeros(3)), "clouds"),
+    (lambda: js.from_sdf(js.sdf.ball((0.0, 0.0, 0.0), 1.0), ((-1, -1), (1, 1)), 0.2), "clouds"),
+    (lambda: js.plot.vectors(js.solve(js.Problem(poisson, ENDS), LINE)), "pictures"),
+    (lambda: js.files.from_csv(3), "pictures"),
+    (solve(pde=lambda u, x: js.partial(u, (1, 0))(x)), "problems"),
+    (solve(pde=lambda u, x: js.dt(u, 3)(x)), "time"),
     (lambda: js.eigen(js.Problem(poisson, ENDS), LINE, 0), "modes"),
     (lambda: js.evolve(js.Problem(poisson, ENDS), LINE, 0.0, (1.0, 0.0), steps=2), "time"),
     (lambda: js.tune(js.Problem(poisson, ENDS), LINE, js.Gaussian(0.3, 2.0), objective="best"), "gradients"),
@@ -92,3 +103,59 @@ def test_errors_of_others_stay_as_they_are():
     assert "of the user's own" in str(caught.value)
     with pytest.raises(ZeroDivisionError, match="division by zero$"):
         js.continuation(lambda c: 1 / 0, LINE, [1.0, 2.0])
+
+
+def told(error):
+    """Whether an error's last words name a page of the documentation, and no other words do."""
+    found = re.findall(r"\(docs: ([\w/-]+)(#[\w-]+)?\)", str(error))
+    return len(found) == 1 and str(error).endswith(")") and (ROOT / "docs" / f"{found[0][0]}.md").exists()
+
+
+def nonsense(call, count):
+    """What a callable says of arguments that fit nothing."""
+    for what in (object(), -1.5, None, "odd", [1.0, float("nan")]):
+        try:
+            call(*[what] * count)
+        except (ValueError, ImportError, js.SolveError) as error:
+            yield what, error
+
+
+def of_all_names():
+    """Every public function and class that is called with arguments, as many of them as it needs."""
+    skipped = ("Factorization", "Formulation", "Method", "Solver", "multi_indices")  # nobody makes them; it caches
+    for name in js.__all__:
+        thing = getattr(js, name)
+        for key in thing.__all__ if inspect.ismodule(thing) else [""]:
+            call = getattr(thing, key) if key else thing
+            if name not in skipped and callable(call):
+                needed = [p for p in inspect.signature(call).parameters.values() if p.default is p.empty and p.kind < 2]
+                if needed:
+                    yield f"{name}.{key}", call, len(needed)
+
+
+def test_whatever_public_name_refuses_its_arguments_tells_the_place():
+    refused = [(name, what, error) for name, call, count in of_all_names() for what, error in nonsense(call, count)]
+    assert not [x for x in refused if not told(x[2])]
+    assert len({name for name, *_ in refused}) > 70  # of some 80; the others take anything at first
+
+
+def test_methods_tell_the_place_too():
+    problem = js.Problem(poisson, ENDS)
+    sol, kept = js.solve(problem, LINE, order=2), js.factorize(problem, LINE, order=2)
+    heat = js.Problem(lambda u, x, t: js.dt(u)(x) - js.laplacian(u)(x), ENDS)
+    run = js.evolve(heat, LINE, lambda x: x[0], t=(0.0, 0.1), steps=2, order=2, progress=False)
+    held = {side: js.dirichlet(0.0) for side in ENDS}
+    modes = js.eigen(js.Problem(lambda u, x: -js.laplacian(u)(x), held), LINE, 1, order=2)
+    kernel = js.SuperGaussian(0.2, 2.0)
+    refused = [
+        error
+        for call, count in ((sol, 1), (sol.grad, 1), (sol.derivative, 2), (sol.integral, 1), (sol.flux, 1),
+                            (kept.solve, 1), (run.at, 1), (modes, 2), (modes.grad, 2), (modes.derivative, 3),
+                            (kernel.normalization, 1), (LINE.replace, 1))
+        for _, error in nonsense(call, count)
+    ]  # fmt: skip
+    assert len(refused) > 40 and not [error for error in refused if not told(error)]
+    for change in (lambda: problem.replace(nothing=1), lambda: kernel.replace(nothing=1)):
+        with pytest.raises(ValueError) as caught:
+            change()
+        assert told(caught.value)

@@ -84,7 +84,8 @@ def judgement(records: list[dict[str, Any]], seed: int) -> dict[str, Any]:
         f"the spacing, in float64. {part}{kinds}, {sum(r['dim'] == 3 for r in records)} in 3D. "
         f"*Wrong*: an error above {WRONG:.0%} (relative L2, of the worst field); *accurate*: below {RIGHT:.0%}. "
         f"Flagged are {needless} of the {right} solutions with an error below {RIGHT:.0%} "
-        f"({needless / max(right, 1):.1%})."
+        f"({needless / max(right, 1):.1%}). *Another solution*: of a nonlinear problem that has more than the one it "
+        "was made from; found again on a cloud twice as fine two orders higher, while from its own the case keeps that."
     )
     rows = [[name, *counts(some)] for name, some in _rows(records)]
     return {"columns": ["cases", "tried", *KINDS], "rows": rows, "note": note}

@@ -108,7 +108,10 @@ def on_page_content(content, page, config, files):
     content = MATH.sub(mathml, content)
     content = NAME.sub(linked, content)
     content = re.sub(r"<td>(-?[\d.]+e[-+]\d+)</td>", r'<td class="number">\1</td>', content)
-    return re.sub(r"<table>(.*?)</table>", r'<div class="wide"><table>\1</table></div>', content, flags=re.S)
+    content = re.sub(r"<table>(.*?)</table>", r'<div class="wide"><table>\1</table></div>', content, flags=re.S)
+    # Tables of measured numbers: nobody searches for them, and they would stand before what is searched for.
+    measured = re.compile(r'(<!-- table: [^>]*>(?:(?!<div).)*<div class="wide")', re.S)
+    return measured.sub(r"\1 data-search-exclude", content)
 
 
 def summary(name):

@@ -16,6 +16,7 @@ from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.equation.problem import Problem
 from jsmitsm.equation.unknowns.extras import refuse_extras
 from jsmitsm.linear.linsolve import Solver
+from jsmitsm.runtime import notebooks
 from jsmitsm.runtime.arrays import ValueOrFunction
 from jsmitsm.runtime.errors import did_you_mean, explaining, is_number, is_whole, short
 from jsmitsm.runtime.progress import bar
@@ -107,6 +108,13 @@ class Adapted:
             f"Adapted(error={self.error:.2g}, tol={self.tol:.2g}, reached={self.reached}, {len(self.cloud)} particles, "
             f"order={self.solution.order}, {rounds} round{'s' if rounds > 1 else ''})"
         )
+
+    def _repr_html_(self) -> str:
+        rows: list[tuple[str, Any]] = [("estimated error", f"{self.error:.2g}, {self.tol:.2g} asked for")]
+        rows += [("reached", self.reached), ("particles", len(self.cloud)), ("rounds", len(self.history["particles"]))]
+        rows += [] if self.quantity is None else [("quantity", f"{self.quantity:.8g}")]
+        rows += [("flags", " ".join(self.flags) or "none"), ("besides", " ".join(self.messages) or "nothing")]
+        return notebooks.shown("Adapted", rows) + self.solution._repr_html_()
 
 
 @explaining

@@ -11,8 +11,9 @@ from jsmitsm.adaptation.spacing_field import GROWTH
 # The error aimed at, in parts of the tolerance: what is predicted is not always met.
 SAFETY = 0.4
 # A spacing changes by at most these factors in a round: refined where the solution is smooth, where it is known not to
-# be, and coarsened: freely where the error says nothing yet, later gently, or rounds would undo each other.
-FINER, SINGULAR, COARSER, GENTLY = 0.3, 0.05, 3.0, 1.4
+# be, and coarsened: freely where the error says nothing yet, later gently, and not at all within some factor of what is
+# wanted, or rounds would undo each other.
+FINER, SINGULAR, COARSER, GENTLY, FAR = 0.3, 0.05, 3.0, 1.4, 10.0
 # Where refining helped with less than this part of the expected power, the solution is not smooth.
 _ROUGH = 0.6
 _SLOWEST = 0.35
@@ -78,7 +79,8 @@ def next_spacing(found: Marks, power: float, error: float, wanted: float, most: 
     dim = found.points.shape[1]
     lowest = np.where(found.singular, SINGULAR, FINER)
     rate = np.where(found.singular, found.rate, np.maximum(found.rate, _ROUGH * power))
-    goal, count, coarser = aim, float(len(eta)), COARSER if error > ROUGH else GENTLY
+    goal, count = aim, float(len(eta))
+    coarser = COARSER if error > ROUGH else GENTLY if error > FAR * wanted else 1.0
     for _ in range(200):
         factor = np.clip((goal / eta) ** (1.0 / rate), lowest, coarser)
         count = float(_children(factor, dim).sum())

@@ -45,8 +45,8 @@ _GROWTH, _SMALL, _LEAST, _LARGE = 5.0, {1: 400, 2: 1500, 3: 3000}, 1.5, 5000
 _PART, _DEGREE = 0.05, 4
 # After so many rounds without a smaller error by this factor the search ends.
 _STALLED, _BETTER = 3, 0.7
-# Estimates of two orders may differ by this factor where both are right.
-_AGREE = 3.0
+# From this part of the distance to it on, the error of the solve that checks explains the distance.
+_OTHERS = 0.5
 
 
 class Rounds:
@@ -68,6 +68,7 @@ class Rounds:
         self.data: Data | None = None
         self.least, self.highest, self.shallow = 1, ORDERS[-1], False
         self.before: Marks | None = None
+        self.best: tuple[int, float, SpacingField] | None = None  # order, error and spacing of the best round so far
         self.apart: np.ndarray | None = None  # gaps between neighbours, where they are what is wrong
 
     def history(self) -> dict[str, np.ndarray]:
@@ -209,21 +210,30 @@ class Rounds:
         return self.reached
 
     def _checked(self, sol: Solution, cloud: Cloud, spacing: SpacingField) -> None:
-        """The distance to a solve of another order: where it is larger than the estimate, that is the error."""
+        """The distance to a solve of another order: where it is larger than the estimate, that is the error.
+
+        Unless it is the error of the other, which where a solution is barely resolved may be the larger one.
+        """
         try:
             other = self._solve(cloud, sol.order + 2, None if sol.iterations == 1 else np.asarray(sol.u))
         except (ValueError, SolveError) as error:
             self.messages.append(f"No solve of another order could check the error: {error}")
             return
+        h = spacing(np.asarray(cloud.points))
         if self.quantity is None:
             values = np.asarray(sol.u).reshape(len(cloud), -1)
             away = np.asarray(other.u).reshape(len(cloud), -1) - values
-            apart = size(away, values, spacing(np.asarray(cloud.points)), self.norm, cloud.dim)
+            apart = size(away, values, h, self.norm, cloud.dim)
         else:
             number, again = self.number or 0.0, float(np.asarray(self.quantity(other)).sum())
             apart = abs(again - number) / (abs(number) or 1.0)
-        if apart > self.error:
-            self.error = apart
+        if apart <= self.error:
+            return
+        if apart > self.tol:
+            own = measured(other, h, self._operator_order(other), self.norm, self.quantity).error
+            if np.isfinite(own) and own > _OTHERS * apart:
+                return
+        self.error = apart
 
     def _stalled(self) -> bool:
         errors = [row[2] for row in self.rows]
@@ -253,14 +263,18 @@ class Rounds:
             finer, _ = next_spacing(parted, power, float(apart.max()) / found.scale / _GAP, self.tol, most)
             made_h = np.where(finer < h, np.minimum(made_h, finer), made_h)
         field = SpacingField(points, made_h, spacing.largest)
+        if self._coarsened_too_much(spacing):
+            assert self.best is not None
+            field = self.best[2].joined(points, made_h)
         for _ in range(8):
             try:
                 following = self._cloud(field)
             except ValueError as refusal:
                 if "cells" not in str(refusal) and "too coarse" not in str(refusal):
                     raise
-                field = SpacingField(points, np.maximum(field.spacing, 4.0 * field.spacing.min()), spacing.largest) if (
-                    "cells" in str(refusal)) else field.scaled(0.7)  # fmt: skip
+                coarser = np.maximum(field.spacing, 4.0 * field.spacing.min())
+                few = "cells" in str(refusal)
+                field = SpacingField(field.points, coarser, field.largest) if few else field.scaled(0.7)
                 continue
             if len(following) > self.max_particles:
                 field = field.scaled((1.1 * len(following) / self.max_particles) ** (1.0 / cloud.dim))
@@ -272,6 +286,15 @@ class Rounds:
             self._limit("the cloud's maker, which refused finer ones")
             return None
         return field, following
+
+
+    def _coarsened_too_much(self, spacing: SpacingField) -> bool:
+        """Whether a round before this one did better; then no spacing grows over that of the best of them."""
+        order, error = self.rows[-1][1:3]
+        if self.best is not None and self.best[0] == order and error > self.best[1]:
+            return True
+        self.best = (order, error, spacing) if error < ROUGH else None
+        return False
 
 
 def spent(history: dict[str, np.ndarray], tol: float) -> float:

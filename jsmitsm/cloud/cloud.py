@@ -145,6 +145,7 @@ class Cloud:
         """Indices of all particles that are not in the interior, ascending."""
         return np.setdiff1d(np.arange(len(self)), self.groups[INTERIOR])
 
+    @explaining
     def replace(self, points: ArrayLike | None = None, normals: ArrayLike | None = None) -> Cloud:
         """The same groups with other points or normals (traced values welcome).
 

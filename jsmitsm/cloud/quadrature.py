@@ -11,6 +11,7 @@ from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.cloud.domain_quadrature import domain_rule
 from jsmitsm.cloud.regions.region_cloud import RegionCloud, sides
 from jsmitsm.cloud.triangulation import boundary_facets, lying_on
+from jsmitsm.runtime.errors import explaining
 from jsmitsm.taylor.multi_indices import multi_indices
 
 # A particle's normal shapes a facet if it is within 30 degrees of the facet's own; beyond, there is a corner.
@@ -34,6 +35,7 @@ class Quadrature(NamedTuple):
         return f"Quadrature({len(self.points)} points, weights that sum to {self.weights.sum():.6g})"
 
 
+@explaining
 def quadrature(cloud: Cloud, group: str | None = None, degree: int = 8) -> Quadrature:
     """Points and weights for integrals over a boundary group, or over the domain where no group is named.
 
@@ -76,6 +78,10 @@ def quadrature(cloud: Cloud, group: str | None = None, degree: int = 8) -> Quadr
     """
     if isinstance(degree, bool) or not isinstance(degree, (int, np.integer)) or degree < 1:
         raise ValueError(f"degree: expected a whole number from 1, got {degree!r}")
+    if not isinstance(cloud, Cloud):
+        raise ValueError(f"cloud: expected a js.Cloud, got {type(cloud).__name__}")
+    if group is not None and not isinstance(group, str):
+        raise ValueError(f"group: expected the name of a boundary group, got {group!r}")
     if isinstance(cloud, RegionCloud):
         return _of_regions(cloud, group, degree)
     if group is None:

@@ -9,6 +9,7 @@ import numpy as np
 from jsmitsm.cloud import filling
 from jsmitsm.cloud.cloud import INTERIOR, Cloud
 from jsmitsm.cloud.regions.region_cloud import RegionCloud
+from jsmitsm.runtime.errors import explaining
 
 
 class Quality(NamedTuple):
@@ -45,6 +46,7 @@ class Quality(NamedTuple):
         return f"Quality({', '.join(f'{name}={value:.3g}' for name, value in self._asdict().items())})"
 
 
+@explaining
 def quality(cloud: Cloud, spacing: filling.SpacingLike | None = None) -> Quality:
     """How evenly the particles of a cloud lie, measured in local spacings so that graded clouds count alike.
 
@@ -72,6 +74,8 @@ def quality(cloud: Cloud, spacing: filling.SpacingLike | None = None) -> Quality
     >>> round(js.quality(js.rectangle((0, 0), (1, 1), (11, 11))).mesh_ratio, 3)
     1.414
     """
+    if not isinstance(cloud, Cloud):
+        raise ValueError(f"cloud: expected a js.Cloud, got {type(cloud).__name__}")
     if isinstance(cloud, RegionCloud):
         parts = [quality(cloud.region(name), spacing) for name in cloud.regions]
         least = ("separation", "evenness", "separation_distance")

@@ -48,21 +48,28 @@ def least_squares_right_side(disc: Discretization, nums: Numbers, parts: list[tu
     return _added_up(*zip(*loads), np.zeros(_unknown_count(disc)))
 
 
-def misfit(disc: Discretization, nums: Numbers, values: Any) -> np.ndarray:
+def misfit(disc: Discretization, nums: Numbers, values: Any, parts: list[tuple[Class, Block]] | None = None) -> Any:
     """By how much each particle's value (N, F) misses its local fit, in the least-squares form.
 
-    A field that counts fewer derivatives than the others has another unit, and is left out.
+    A field that counts fewer derivatives than the others has another unit, and is left out. parts: as ``least_squares``
+    has filled them, else made again.
     """
     shared, there = shared_elimination(disc, nums), around(disc, nums)
-    own, found = np.flatnonzero(np.array(disc.rec.weights) == 0), np.zeros(len(disc.cloud))
-    for cls in _fitted(disc, nums):
-        block = _class_blocks(disc, nums, cls, shared, there)
-        near = np.maximum(disc.images.owners(cls.neighbours), 0)
-        data = [np.asarray(x)[near].reshape(len(near), -1) for x in (values, nums.gamma)]
-        fitted = np.einsum("nij,nj->ni", np.asarray(block.matrix)[:, own], np.concatenate(data, axis=1))
-        load = np.einsum("nir,nr->ni", np.asarray(block.right)[:, own], _right_values(disc, nums, cls))
-        found[cls.ids] = np.abs(fitted - load).max(axis=1)
-    return found[nums.ids]
+    own = np.flatnonzero(np.array(disc.rec.weights) == 0)
+    if parts is None:
+        parts = [(cls, _class_blocks(disc, nums, cls, shared, there)) for cls in _fitted(disc, nums)]
+    found = [_missed(disc, nums, cls, block, values)[:, own] for cls, block in parts]
+    ids, xp = np.concatenate([cls.ids for cls, _ in parts]), jnp if is_traced(found) else np
+    return xp.max(xp.abs(xp.concatenate(found)), axis=1)[np.argsort(ids)]
+
+
+def _missed(disc: Discretization, nums: Numbers, cls: Class, block: Block, values: Any) -> Any:
+    """What the fits of a class leave of their data (n, m)."""
+    near = np.maximum(disc.images.owners(cls.neighbours), 0)
+    xp = jnp if is_traced(block, values, nums.gamma) else np
+    data = xp.concatenate([xp.asarray(x)[near].reshape(len(near), -1) for x in (values, nums.gamma)], axis=1)
+    fitted = xp.einsum("nij,nj->ni", xp.asarray(block.matrix), data)
+    return fitted - xp.einsum("nir,nr->ni", xp.asarray(block.right), xp.asarray(_right_values(disc, nums, cls)))
 
 
 def _unknown_count(disc: Discretization) -> int:

@@ -51,7 +51,9 @@ def meant(function: Callable[..., Any]) -> Callable[..., Any]:
     0.5
     """
     if not callable(function):
-        raise ValueError(f"function: expected a function, such as a coefficient of x, got {type(function).__name__}")
+        raise ValueError(
+            f"function: expected a function, such as a coefficient of x, got {type(function).__name__} (docs: problems)"
+        )
 
     @functools.wraps(function)
     def marked(*args: Any, **options: Any) -> Any:

@@ -49,7 +49,12 @@ def partial(u: Any, multi_index: MultiIndex | int) -> Any:
     >>> float(partial(lambda y: y[0] ** 2 * y[1], (1, 1))(jnp.array([3.0, 5.0])))
     6.0
     """
-    index = (multi_index,) if isinstance(multi_index, int) else tuple(int(k) for k in multi_index)
+    try:
+        index = (multi_index,) if isinstance(multi_index, int) else tuple(int(k) for k in multi_index)
+    except (TypeError, ValueError):
+        raise ValueError(
+            f"multi_index: expected D whole numbers such as (1, 0), got {multi_index!r} (docs: problems)"
+        ) from None
     if isinstance(u, Field):
         return u._shifted(index)
     if isinstance(u, LocalField):
@@ -58,7 +63,7 @@ def partial(u: Any, multi_index: MultiIndex | int) -> Any:
     def derivative(x: Any) -> Any:
         x = _point(x)
         if len(index) != len(x) or any(k < 0 for k in index):
-            raise ValueError(f"multi_index must be {len(x)} non-negative integers, got {index}")
+            raise ValueError(f"multi_index must be {len(x)} non-negative integers, got {index} (docs: problems)")
         function = _array_valued(u)
         for axis, times in enumerate(index):
             for _ in range(times):
@@ -213,7 +218,9 @@ def divergence(v: Any) -> Any:
     16.0
     """
     if isinstance(v, Field):
-        raise ValueError("v must be a vector field with D components, got a scalar field; did you mean grad(u)?")
+        raise ValueError(
+            "v must be a vector field with D components, got a scalar field; did you mean grad(u)? (docs: problems)"
+        )
     if isinstance(v, LocalField):
         _check_last_axis(v.shape, v.dim)
         rows = (slice(None),) * (v.ndim - 1)
@@ -263,13 +270,13 @@ def dt(u: Same, order: int = 1) -> Same:
     >>> heat = lambda u, x, t: js.dt(u)(x) - js.laplacian(u)(x)
     """
     if isinstance(order, bool) or order not in (1, 2):
-        raise ValueError(f"order: js.dt(u, order) takes 1 or 2, got {order!r}")
+        raise ValueError(f"order: js.dt(u, order) takes 1 or 2, got {order!r} (docs: time)")
     if isinstance(u, LocalField):
         return u._map(lambda f: dt(f, order))
     if not isinstance(u, Field) or any(sum(index) for _, index in u.terms):
         raise ValueError(
             "u: js.dt takes the unknown u itself, or u[k] of a system; write the rate of a product by its rule, and a "
-            "derivative of a rate as an unknown of its own"
+            "derivative of a rate as an unknown of its own (docs: time)"
         )
     return Field(u.dim, {(k + order * RATE, index): c for (k, index), c in u.terms.items()})
 
@@ -277,14 +284,15 @@ def dt(u: Same, order: int = 1) -> Same:
 def _check_last_axis(shape: tuple[int, ...], dim: int) -> None:
     if not shape or shape[-1] != dim:
         raise ValueError(
-            f"v must give {dim} components on its last axis, one per dimension of the point, got shape {tuple(shape)}"
+            f"v must give {dim} components on its last axis, one per dimension of the point, got shape {tuple(shape)} "
+            "(docs: problems)"
         )
 
 
 def _point(x: Any) -> jax.Array:
     x = jnp.asarray(x)
     if x.ndim != 1:
-        raise ValueError(f"x must be one point of shape (D,), got shape {x.shape}")
+        raise ValueError(f"x must be one point of shape (D,), got shape {x.shape} (docs: problems)")
     return x
 
 
@@ -292,13 +300,15 @@ def _array_valued(function: Any) -> Callable[[Any], Any]:
     if not callable(function):
         raise ValueError(
             f"an operator takes a field or a function of the point, got {type(function).__name__}; "
-            "write js.grad(u)(x), not js.grad(u(x))"
+            "write js.grad(u)(x), not js.grad(u(x)) (docs: problems)"
         )
 
     def value(y: Any) -> Any:
         out = function(y)
         if isinstance(out, Field | LocalField):
-            raise ValueError("the function returned a field instead of its value: evaluate it, as in js.grad(u)(y)")
+            raise ValueError(
+                "the function returned a field instead of its value: evaluate it, as in js.grad(u)(y) (docs: problems)"
+            )
         return jnp.stack(out) if isinstance(out, list | tuple) else jnp.asarray(out)
 
     return value

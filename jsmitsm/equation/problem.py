@@ -49,6 +49,10 @@ class Problem:
         ``complex`` where u, the residual and the values of the conditions are complex.
     sources : sequence of PointSource
         From ``js.point_source``: what the residual is besides zero, strength delta(x - x0) each.
+    integral : function, optional
+        ``kernel(x, y)`` (and ``params`` last, where given), smooth in both: the residual is pde(u, x) plus the integral
+        of kernel(x, y) u(y) over the whole domain; (F, F) for a system. With several regions a dict gives some
+        equations one. It couples all particles, up to 5000 unknowns.
 
     Raises
     ------
@@ -75,6 +79,7 @@ class Problem:
         unknowns: Mapping[str, Any] | None = None,
         dtype: Any = float,
         sources: Sequence[PointSource] = (),
+        integral: Callable[..., Any] | Mapping[str, Callable[..., Any]] | None = None,
     ):
         if isinstance(pde, Mapping):
             pde = per_region(pde)
@@ -92,7 +97,7 @@ class Problem:
         self.fields = int(fields)
         self.params = params
         self.bcs = {name: _listed(name, value, self.fields) for name, value in bcs.items()}
-        self.extras = extras(constraints, unknowns, dtype, sources, self.bcs)
+        self.extras = extras(constraints, unknowns, dtype, sources, integral, self.pde, self.bcs)
 
     # Constraints and unknowns; most problems have none.
     extras: Extras | None = None
@@ -117,14 +122,23 @@ class Problem:
         """The point sources."""
         return () if self.extras is None else self.extras.sources
 
+    @property
+    def integral(self) -> Any:
+        """The kernel of the integral term, those of the regions in a dict; None without one."""
+        found = () if self.extras is None else self.extras.kernels
+        if not found:
+            return None
+        return found[0][1] if found[0][0] is None else {str(name): kernel for name, kernel in found}
+
+    @explaining
     def replace(self, **changes: Any) -> Problem:
         """The same problem with other parts.
 
         Parameters
         ----------
         **changes : any
-            ``params``, ``pde``, ``bcs``, ``fields``, ``constraints``, ``unknowns``, ``dtype`` or
-            ``sources``.
+            ``params``, ``pde``, ``bcs``, ``fields``, ``constraints``, ``unknowns``, ``dtype``,
+            ``sources`` or ``integral``.
 
         Returns
         -------
@@ -143,7 +157,7 @@ class Problem:
         >>> problem.replace(params=2.0).params
         2.0
         """
-        names = ("pde", "bcs", "fields", "params", "constraints", "unknowns", "dtype", "sources")
+        names = ("pde", "bcs", "fields", "params", "constraints", "unknowns", "dtype", "sources", "integral")
         unknown = sorted(set(changes) - set(names))
         if unknown:
             raise ValueError(f"{unknown[0]}: no part of a Problem; it has {', '.join(names[:-1])} and {names[-1]}"

@@ -15,7 +15,7 @@ from jsmitsm.evolution.space.local_fits import state_fit
 from jsmitsm.evolution.steps import dense_output
 from jsmitsm.runtime import notebooks
 from jsmitsm.runtime.arrays import Array
-from jsmitsm.runtime.errors import explained
+from jsmitsm.runtime.errors import explained, explaining
 from jsmitsm.runtime.tracers import frozen, is_traced
 from jsmitsm.solution.fit import Recipe
 from jsmitsm.solution.regions.solution import RegionsSolution
@@ -123,6 +123,7 @@ class Evolution:
             lines.append(f"The estimated error in time is {s['error_in_time']:.1e} of the solution.")
         return "\n".join(lines)
 
+    @explaining
     def at(self, t: Any) -> Solution:
         """The solution at any time: values anywhere, gradients, integrals.
 
@@ -175,10 +176,12 @@ class Evolution:
         kind = RegionsSolution if isinstance(self.cloud, RegionCloud) else Solution
         return kind(u, self.cloud, self._recipe, self._fit, self.converged, 1, stats)
 
+    @explaining
     def error_estimate(self) -> Array:
         """Estimated error at every particle and saved time.
 
-        In space by the defect that a pencil of order p + 2 finds, in time by the embedded scheme. Computed when asked.
+        In space by the defect that a pencil of order p + 2 finds, in time by the embedded scheme. Computed when asked;
+        from then on an error above 2 % of the solution is a flag.
 
         Returns
         -------
@@ -229,6 +232,7 @@ class Evolution:
         rows += [("converged", bool(np.all(self.converged))), ("flags", " ".join(self.flags) or "none")]
         return notebooks.shown("Evolution", rows, notebooks.dots(np.asarray(self.cloud.points), last[:, 0], 0))
 
+    @explaining
     def to_xarray(self) -> Any:
         """The saved states as a data set with the dimensions time, particle (and field).
 

@@ -22,7 +22,7 @@ from jsmitsm.taylor.multi_indices import HIGHEST
 HISTORY = 2**29
 # Growth of the largest value that no problem means.
 BLOWN = 1e30
-# An estimated error in time above this part of the solution is a flag.
+# An estimated error, in time or in all, above this part of the solution is a flag.
 LARGE = 0.02
 
 
@@ -230,7 +230,15 @@ def _finished(run: Run, parts: np.ndarray, history: History, fault: str, began: 
     fit = run.semi.state_fit(degree)
     kept = np.array(history.times), np.stack(history.states)
     moved = np.stack(history.rates) if history.rates else None
-    report = Report(flags, told, lambda: estimated(run, np.asarray(times), kept, moved, later))
+
+    def estimate() -> np.ndarray:
+        found = estimated(run, np.asarray(times), kept, moved, later)
+        part = float(found.max(initial=0.0)) / (history.scale or 1.0)
+        if part > LARGE and not (in_time is not None and in_time > LARGE):
+            flags.append(f"The estimated error is {part:.0%} of the solution: refine the cloud, or raise the order.")
+        return found
+
+    report = Report(flags, told, estimate)
     return Evolution(times, states, rates, run.cloud, recipe, not fault, stats, kept, report, fit)
 
 

@@ -13,9 +13,10 @@ from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.discretization.coefficients import slot_series
 from jsmitsm.discretization.layout import discretize
 from jsmitsm.discretization.pencil.assemble import assemble_pencil
+from jsmitsm.discretization.pencil.fits import local_fits
 from jsmitsm.equation.field import RATE
-from jsmitsm.evolution.space.convection import flag_divergence, refuse_convection
-from jsmitsm.evolution.space.semidiscrete import Driver, Semidiscrete, local_fits
+from jsmitsm.evolution.space.convection import flag_divergence, flag_open, refuse_convection
+from jsmitsm.evolution.space.semidiscrete import Driver, Semidiscrete
 from jsmitsm.evolution.space.timed import Timed
 from jsmitsm.evolution.steps.newton import Newton
 from jsmitsm.evolution.steps.stepping import RadauStepper, Stepper
@@ -35,7 +36,8 @@ class Run:
         self.timed, self.cloud, self.start, self.t, self.began = timed, cloud, start, t, began
         self.order, self.stencils, self.throw, self.depth = order, stencils, throw, depth
         self.params = timed.problem.params[1]
-        self.traced = is_traced(self.params, start, t, cloud, timed.problem, timed.rest, timed.masses)
+        self.traced = is_traced(self.params, start, t, cloud, timed.problem, timed.rest, timed.masses,
+                                timed.apart)  # fmt: skip
         self.fields = timed.problem.fields
         self.second = bool(timed.masses[1].slots)
         self.flags: list[str] = []
@@ -86,9 +88,10 @@ class Run:
 
     def _damping(self, asked: Any) -> float:
         """The factor of the damping matrix."""
-        operator = self.timed.operator
+        operator, rates = self.timed.operator, self.timed.masses[0]
+        own = [{k % RATE for (k, _), p in zip(rates.slots, row) if p} for row in rates.pattern]
         coupled = not self.second and self.fields > 1 and all(
-            not any(p and k == e and sum(b) == operator.order[e] for (k, b), p in zip(operator.slots, row))
+            not any(p and k in own[e] and sum(b) == operator.order[e] for (k, b), p in zip(operator.slots, row))
             for e, row in enumerate(operator.pattern)
         )  # fmt: skip
         if isinstance(asked, str) and asked == "auto":
@@ -109,12 +112,11 @@ class Run:
     def pencil(self, t: Any, u: Any) -> Semidiscrete:
         """The semidiscrete equations, linearised at the values u (N, F) where the problem is quasilinear."""
         timed, began = self.timed, time.perf_counter()
-        massed = np.zeros(self.fields, bool)
-        for record in (*timed.masses, timed.rest):
-            massed |= record.pattern.any(axis=1) if record.slots else record.source != "zero"
         problem = timed.at(t, self.params)
         self.counts["pencils"] += 1
-        options: dict[str, Any] = {"order": self.order, "mass": massed, "stencils": self.stencils, "depth": self.depth}
+        options: dict[str, Any] = {
+            "order": self.order, "mass": timed.sourced, "stencils": self.stencils, "depth": self.depth
+        }  # fmt: skip
         reference = None
         if not timed.quasilinear:
             with jax.ensure_compile_time_eval():  # under jit, too, what is known is computed
@@ -133,6 +135,7 @@ class Run:
             refuse_convection(semi, self.flags)
             if timed.flow is not None:
                 flag_divergence(semi, self.start[0], self.flags)
+                flag_open(semi, self.flags)
         self.told = list(pencil.health)
         self._flag_signs(pencil)
         if timed.flow is not None:

@@ -15,8 +15,9 @@ from jsmitsm.discretization.pencil.assemble import Pencil
 from jsmitsm.equation.problem import Problem
 from jsmitsm.equation.unknowns.extras import refuse_extras
 from jsmitsm.modes.estimate import errors
+from jsmitsm.modes.mass import masses
 from jsmitsm.modes.modes import Modes
-from jsmitsm.modes.question import Question, assembled, masses, operators, reduced
+from jsmitsm.modes.question import Question, assembled, operators, reduced
 from jsmitsm.modes.spectrum import in_real_numbers, modes, normalised, pairs
 from jsmitsm.runtime.arrays import ValueOrFunction
 from jsmitsm.runtime.errors import SolveError, explaining, short
@@ -26,6 +27,8 @@ from jsmitsm.solution.arguments import Depth, check, of_regions
 
 # A condition's value or a source up to this part of what it stands beside is rounding.
 _NOTHING = 1e-12
+# The parts of a double value may stand apart by more than their error's estimate, which is of the first order, says.
+PARTED = 4.0
 
 
 @explaining
@@ -64,7 +67,8 @@ def eigen(
     mass : float, array or function, optional
         A number, an array (F,), or a function of x (and of the problem's params, where it takes two arguments),
         scalar or (F,), with several regions also a dict of these by region; 1 if not given. Equation k has the mass
-        times field k on its right-hand side; zero for an equation without it.
+        times field k on its right-hand side; zero for an equation without it. Or an operator like the pde, a function
+        of (u, x) (and params), of a lower order than the pde: ``lambda u, x: -js.laplacian(u)(x)`` for buckling.
     method : {"S"}
         "S", the only one whose rows know their source.
     order : int
@@ -111,7 +115,8 @@ def eigen(
     refuse_data(disc, pencil)
     fields = problem.fields
     local = time.perf_counter()
-    pattern, a, c = reduced(pencil, weights)
+    pattern, stiff, inert = reduced(pencil, problem, weights)
+    a, c = stiff.values, inert.values
     with_mass = int(massed[pencil.free % fields].sum())
     if count > with_mass:
         raise ValueError(
@@ -119,7 +124,7 @@ def eigen(
             "equation with a mass; ask for fewer (a tenth of them is resolved well), or refine the cloud"
         )
     question = Question(
-        problem, mass, float(near), order, pencil.layout.disc.rec.depth, pencil, weights, massed
+        problem, mass, float(near), order, pencil.layout.disc.rec.depth, pencil, weights, massed, stiff, inert
     )
     size = float(len(cloud))
     known_a, known_c = (concrete(x) for x in (a, c))
@@ -139,7 +144,8 @@ def eigen(
     small = np.abs(found.values.imag) <= 1e-12 * np.abs(found.values)
     if not small.all():
         # Parts of a double value may come as a complex pair, whose imaginary part is an error.
-        small = np.abs(found.values.imag) <= np.maximum(errors(question, found), 1e-10 * np.abs(found.values))
+        error = np.maximum(PARTED * errors(question, found), 1e-10 * np.abs(found.values))
+        small = np.abs(found.values.imag) <= error
     found = normalised(in_real_numbers(found, small), size)
     ended = time.perf_counter()
     stats = {

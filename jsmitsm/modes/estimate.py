@@ -17,6 +17,12 @@ from jsmitsm.taylor.multi_indices import HIGHEST
 _OUTLIER = 4.0
 
 
+def conditions(question: Question, found: Pairs) -> np.ndarray:
+    """The condition numbers (k,) of the values: the sizes of both vectors where their product is one."""
+    dual = question.inert.host_transposed @ found.left
+    return np.linalg.norm(found.right, axis=0) * np.linalg.norm(dual, axis=0)
+
+
 @bar("error estimate", parts=PENCIL)
 def errors(question: Question, found: Pairs) -> np.ndarray:
     """Estimated errors (k,) of the values; infinite where there is no other order to compare with.
@@ -30,13 +36,8 @@ def errors(question: Question, found: Pairs) -> np.ndarray:
     other = _other_order(question)
     if other is None:
         return np.full(len(found.values), np.inf)
-    from scipy.sparse import csr_matrix
-
-    pattern, a, c = reduced(other, np.asarray(question.weights))
-    shape = (pattern.n, pattern.n)
-    more_a = csr_matrix((np.asarray(a), (pattern.rows_a, pattern.cols_a)), shape)
-    more_c = csr_matrix((np.asarray(c), (pattern.rows_c, pattern.cols_c)), shape)
-    rest = more_a @ found.right - (more_c @ found.right) * found.values
+    _, a, c = reduced(other, question.problem, question.weights)
+    rest = a.host @ found.right - (c.host @ found.right) * found.values
     moved = found.left.T @ (_scale(question.pencil, other)[:, None] * rest)
     out = np.zeros(len(found.values))
     for cluster in np.unique(found.cluster):

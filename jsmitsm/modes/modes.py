@@ -12,11 +12,13 @@ import numpy as np
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.discretization.layout import table
 from jsmitsm.discretization.regions.layout import Regions
-from jsmitsm.modes.estimate import errors
-from jsmitsm.modes.question import Question, mass_at
+from jsmitsm.modes.estimate import conditions, errors
+from jsmitsm.modes.mass import mass_times
+from jsmitsm.modes.question import Question
 from jsmitsm.modes.spectrum import Pairs
+from jsmitsm.runtime import notebooks
 from jsmitsm.runtime.arrays import Array, ArrayLike
-from jsmitsm.runtime.errors import explained, short, some
+from jsmitsm.runtime.errors import explained, explaining, short, some
 from jsmitsm.runtime.tracers import frozen, is_traced, owned
 from jsmitsm.solution.fit import Fit, Recipe
 from jsmitsm.solution.regions.fit import RegionsFit
@@ -33,9 +35,7 @@ LOOSE = 1e3
 class Modes:
     """Eigenvalues and modes of an operator, by their distance from what was asked for.
 
-
     ``modes(j, points)`` evaluates mode j at points (M, D), ``modes.grad(j, points)`` its gradient: by local Taylor
-
     polynomials, which satisfy L u = lambda mass u. ``js.plot.values(cloud, modes.u[:, j])`` draws it.
 
     Attributes
@@ -89,6 +89,7 @@ class Modes:
     def __len__(self) -> int:
         return int(np.shape(self._values)[-1])
 
+    @explaining
     def __call__(self, k: int, points: ArrayLike, *, blend: bool = False, outside: str = "nan") -> jax.Array:
         """A mode anywhere.
 
@@ -123,6 +124,7 @@ class Modes:
         """
         return self._between(k)(points, blend=blend, outside=outside)
 
+    @explaining
     def grad(self, k: int, points: ArrayLike, *, blend: bool = False, outside: str = "nan") -> jax.Array:
         """The gradient of a mode anywhere.
 
@@ -157,6 +159,7 @@ class Modes:
         """
         return self._between(k).grad(points, blend=blend, outside=outside)
 
+    @explaining
     def derivative(self, k: int, points: ArrayLike, multi_index: Sequence[int], *, outside: str = "nan") -> jax.Array:
         """Any derivative d^b of a mode anywhere.
 
@@ -211,7 +214,7 @@ class Modes:
         written, number = q.problem, jnp.asarray(value)
 
         def shifted(operator: Any, mass: Any) -> Any:
-            return lambda u, x, *params: operator(u, x, *params) - number * mass_at(written, mass, x) * u(x)
+            return lambda u, x, *params: operator(u, x, *params) - number * mass_times(written, mass, u, x)
 
         disc: Any = q.pencil.layout.disc
         recipe = Recipe("S", q.order, None, "loo", written.fields, q.depth)
@@ -243,9 +246,8 @@ class Modes:
         """The largest entry (k,) of A u - lambda B mass u, relative to the sum of the sizes of its terms."""
         found = self._host("residuals")
         q = self._known("residuals")
-        a, b = (m.host[q.pencil.free][:, q.pencil.free] for m in (q.pencil.A, q.pencil.B))
-        weighted = np.asarray(q.weights).reshape(-1)[q.pencil.free][:, None] * found.right
-        rest = np.abs(a @ found.right - (b @ weighted) * found.values).max(axis=0)
+        a = q.stiff.host
+        rest = np.abs(a @ found.right - (q.inert.host @ found.right) * found.values).max(axis=0)
         return rest / (abs(a) @ np.abs(found.right)).max(axis=0)
 
     def _host(self, what: str) -> Pairs:
@@ -254,6 +256,7 @@ class Modes:
             raise ValueError(f"{what}: these Modes were made under a JAX transform, or not found; ask outside of it")
         return self._found
 
+    @explaining
     def error_estimate(self) -> np.ndarray:
         """Estimated errors of the values, by the pencil of order p + 2, assembled when first asked for.
 
@@ -308,21 +311,15 @@ class Modes:
                 f"{len(short_waves)} of {len(part)} modes, {some(short_waves)}, have waves shorter than four "
                 "particles, which the cloud does not resolve: refine it, or ask for fewer."
             )
-        loose = np.setdiff1d(np.flatnonzero(self._conditions() > LOOSE), bad)
+        feel = conditions(self._known("flags"), self._host("flags"))
+        loose = np.setdiff1d(np.flatnonzero(feel > LOOSE), bad)
         if len(loose):
             out.append(
-                f"{len(loose)} of {len(part)} values, {some(loose)}, feel small errors {self._conditions().max():.0e} "
+                f"{len(loose)} of {len(part)} values, {some(loose)}, feel small errors {feel.max():.0e} "
                 "times, since the operator is far from self-adjoint, as strong convection makes it: the error estimate "
                 "says little; write u = exp(b . x / 2) v for a drift b, or compare with a finer cloud."
             )
         return explained(out)
-
-    def _conditions(self) -> np.ndarray:
-        """The condition numbers (k,) of the values: the sizes of both vectors where their product is one."""
-        found, q = self._host("flags"), self._known("flags")
-        weighted = np.asarray(q.weights).reshape(-1)[q.pencil.free][:, None]
-        dual = weighted * (q.pencil.B.host[q.pencil.free][:, q.pencil.free].T @ found.left)
-        return np.linalg.norm(found.right, axis=0) * np.linalg.norm(dual, axis=0)
 
     def _part(self) -> np.ndarray:
         """The estimated errors (k,) relative to the values, or to a part of the largest, where those are small."""
@@ -379,6 +376,14 @@ class Modes:
             return f"Modes({k} of {n} particles{order})"
         first, last = (f"{complex(x):.6g}" if np.iscomplexobj(x) else f"{float(x):.6g}" for x in self._values[[0, -1]])
         return f"Modes({k} of {n} particles{order}, from {first} to {last})"
+
+    def _repr_html_(self) -> str:
+        if is_traced(self._values, self._u) or np.ndim(self._values) != 1:
+            return repr(self)
+        known = [""] * len(self) if self._errors is None else [f", error {e:.0e}" for e in self._errors]
+        rows = [(f"value {k}", f"{v:.6g}{e}") for k, (v, e) in enumerate(zip(self._values[:12], known))]
+        first = np.real(np.asarray(self._u)[:, 0, 0]) if len(self) else np.zeros(len(self.cloud))
+        return notebooks.shown(repr(self), rows, notebooks.dots(np.asarray(self.cloud.points), first, 0))
 
     def tree_flatten(self):
         return (self._values, self._u, self.cloud, self.converged), None

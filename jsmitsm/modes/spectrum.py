@@ -255,7 +255,7 @@ def _on_host(a: Any, c: Any, pattern: Pattern, near: float, count: int, size: fl
 
 
 def _impl(a: Any, c: Any, **given: Any) -> list[Any]:
-    return [jnp.asarray(x) for x in _on_host(a, c, **given)]
+    return jax.device_put(_on_host(a, c, **given))
 
 
 def _avals(a: Any, c: Any, *, pattern: Pattern, near: float, count: int, size: float) -> list[Any]:

@@ -12,6 +12,7 @@ import numpy as np
 from jsmitsm.cloud.cloud import INTERIOR, Cloud
 from jsmitsm.cloud.regions.region_cloud import RegionCloud
 from jsmitsm.parallel.team import Team, team
+from jsmitsm.runtime.errors import explaining
 from jsmitsm.show.files import from_mesh
 
 # Halvings of an interval until a cut stands between two numbers.
@@ -93,6 +94,7 @@ class ParallelCloud:
         return f"ParallelCloud({len(self.slab)} of {self.slab.count} particles in {self.dim}D here)"
 
 
+@explaining
 def read(
     points: str | os.PathLike[str], groups: Any = None, normals: Any = None, *, names: Mapping[str, int] | None = None,
     tags: str | None = None,

@@ -8,10 +8,12 @@ from jsmitsm.discretization.resolution.digits import room
 from jsmitsm.parallel.assembly import assembled
 from jsmitsm.parallel.local import Local, Settings
 from jsmitsm.parallel.solution import ParallelSolution
+from jsmitsm.runtime.errors import explaining
 from jsmitsm.solution.estimate import compared
 from jsmitsm.taylor.multi_indices import HIGHEST
 
 
+@explaining
 def error_estimate(sol: ParallelSolution) -> np.ndarray:
     """Estimated error |u - u_exact| at the own particles; see ``js.Solution.error_estimate``.
 

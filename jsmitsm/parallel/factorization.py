@@ -22,6 +22,7 @@ from jsmitsm.parallel.solution import ParallelSolution
 from jsmitsm.parallel.solving import check_asked, recipe
 from jsmitsm.parallel.team import team
 from jsmitsm.particle.kernels import Kernel
+from jsmitsm.runtime.errors import explaining
 from jsmitsm.solution.arguments import Depth
 from jsmitsm.solution.kept_matrix import refuse_other
 
@@ -38,6 +39,7 @@ class ParallelFactorization:
         self._pieces: list[Piece] = []
         self.system, _ = assembled(local.team, local, solver, kept=self._pieces)
 
+    @explaining
     def solve(self, problem: Problem) -> ParallelSolution:
         """The solution of a problem with the same operator; source and values of conditions may differ.
 
@@ -105,6 +107,7 @@ def _same(new: Numbers, old: Numbers) -> bool:
                for name in ("jac", "own", "data"))  # fmt: skip
 
 
+@explaining
 def factorize(
     problem: Problem, cloud: Cloud | ParallelCloud, *, method: str = "S", order: int = 4, depth: Depth = "auto",
     kernel: Kernel | None = None, formulation: str = "auto", solver: str = "auto",

@@ -11,11 +11,13 @@ import numpy as np
 from jsmitsm.cloud.triangulation import simplices
 from jsmitsm.parallel.solution import ParallelSolution
 from jsmitsm.runtime.arrays import ArrayLike
+from jsmitsm.runtime.errors import explaining
 from jsmitsm.show.mesh_files import needed
 
 _CELLS = {2: "triangle", 3: "tetra"}
 
 
+@explaining
 def save(sol: ParallelSolution, path: str | os.PathLike[str], **more: ArrayLike) -> None:
     """Write ``path`` (.pvtu) and beside it a .vtu of every process. Needs meshio.
 

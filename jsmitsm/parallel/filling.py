@@ -15,8 +15,10 @@ from jsmitsm.cloud.packing.octree import morton
 from jsmitsm.cloud.shapes import checked_bounds, checked_seed, from_sdf, grouped, own_normals
 from jsmitsm.parallel.distributed import ParallelCloud, Slab, placed
 from jsmitsm.parallel.team import Team, team
+from jsmitsm.runtime.errors import explaining
 
 
+@explaining
 def cloud_from(make: Callable[..., Any], *arguments: Any, **options: Any) -> ParallelCloud:
     """A shape filled by all processes, each its own slab of it.
 

@@ -20,10 +20,12 @@ from jsmitsm.parallel.distributed import ParallelCloud
 from jsmitsm.parallel.local import Local
 from jsmitsm.parallel.shares import local_kernel, local_problem
 from jsmitsm.parallel.solving import solve
+from jsmitsm.runtime.errors import explaining
 
 WRT = ("params", "points")
 
 
+@explaining
 def value_and_grad(
     objective: Callable[..., Any], problem: Problem, cloud: Cloud | ParallelCloud, *, wrt: str = "params",
     **options: Any,

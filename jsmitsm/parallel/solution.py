@@ -9,6 +9,7 @@ import numpy as np
 from jsmitsm.parallel.halo import from_box
 from jsmitsm.parallel.team import Team, team
 from jsmitsm.runtime.arrays import ArrayLike
+from jsmitsm.runtime.errors import explaining
 from jsmitsm.runtime.tracers import frozen
 from jsmitsm.solution.evaluation import checked_points
 from jsmitsm.solution.fit import Recipe
@@ -90,6 +91,7 @@ class ParallelSolution:
                 f"method={self._recipe.method!r}, order={self._recipe.order})")  # fmt: skip
 
 
+@explaining
 def norm(values: ArrayLike, kind: str = "max") -> float:
     """A norm of values of which every process has its own.
 
@@ -125,6 +127,7 @@ def norm(values: ArrayLike, kind: str = "max") -> float:
     return float(np.sqrt(total / max(count, 1)))
 
 
+@explaining
 def evaluate(sol: ParallelSolution, points: ArrayLike, multi_index: tuple[int, ...] | None = None, *,
              outside: str = "nan") -> np.ndarray:  # fmt: skip
     """Values or a derivative anywhere: every process asks for points of its own choice.

@@ -20,11 +20,12 @@ from jsmitsm.parallel.system import SOLVERS
 from jsmitsm.parallel.team import Team, team
 from jsmitsm.particle.kernels import Kernel
 from jsmitsm.runtime.arrays import ValueOrFunction
-from jsmitsm.runtime.errors import did_you_mean
+from jsmitsm.runtime.errors import did_you_mean, explaining
 from jsmitsm.solution.arguments import Depth, check
 from jsmitsm.solution.fit import Recipe
 
 
+@explaining
 def solve(
     problem: Problem, cloud: Cloud | ParallelCloud, *, method: str = "S", order: int = 4, depth: Depth = "auto",
     kernel: Kernel | None = None, formulation: str = "auto", solver: str = "auto", u0: ValueOrFunction | None = None,

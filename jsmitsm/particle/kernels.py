@@ -54,10 +54,8 @@ class Kernel:
     @explaining
     def __init__(self, profile: Callable[..., Any], h: ArrayLike, d: ArrayLike, params: Any = None):
         if not callable(profile):
-            raise ValueError(
-                f"profile: expected a function of the scaled distance r, got {type(profile).__name__}; "
-                "the package's own kernels are e.g. js.SuperGaussian(h, d)"
-            )
+            raise ValueError(f"profile: expected a function of the scaled distance r, got {type(profile).__name__}; "
+                             "the package's own kernels are e.g. js.SuperGaussian(h, d)")  # fmt: skip
         self._profile = profile
         self.params = params
         self._set(h, d)
@@ -150,6 +148,7 @@ class Kernel:
         """
         return self.replace(h=cast(Array, self.h)[i]) if jnp.ndim(self.h) else self
 
+    @explaining
     def replace(self, **changes: Any) -> Kernel:
         """The same kernel with other numbers.
 
@@ -233,6 +232,7 @@ class SuperGaussian(_Named):
     def profile(self, r: Any) -> jax.Array:
         return (self.d**2 - r**2) * jnp.exp(-(r**2))
 
+    @explaining
     def normalization(self, dim: int) -> float | Array:
         """The constant G / (h sqrt(pi))^D of eq. (30).
 

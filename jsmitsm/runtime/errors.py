@@ -33,16 +33,19 @@ SYMPTOMS = {
     "The estimated error is": "estimate",
     "No order reaches the tolerance": "tolerance",
     "The data may not balance": "balance",
+    "do not resolve the kernel": "kernel",
     "where regions meet": "meeting",
     "The estimated error in time": "time",
     "Between neighbouring particles convection": "drift",
     "has the wrong sign": "sign",
     "free of divergence": "divergence",
+    "anything of the pressure": "outlet",
     "are not resolved, or spurious": "modes",
     "shorter than four": "modes",
     "far from self-adjoint": "self-adjoint",
 }
-# What an error says, and its place on that page; else the page about the argument that it begins with.
+# What an error says, and its place on that page; else the page about the argument that it begins with, else that about
+# the package that raised it. Names of arguments mean other things in pictures.
 REFUSALS = {
     "js.meant": "branch",
     "data do not balance": "balance",
@@ -56,9 +59,9 @@ REFUSALS = {
     "do not determine the solution": "resonance",
 }
 PAGES = {
-    "problems": "bcs constraint constraints field fields indices params pde periodic problem sources unknowns",
+    "problems": "bcs constraint constraints field fields indices integral params pde periodic problem sources unknowns",
     "clouds": "a b bounds cloud groups hi holes jitter lo n normals points sdf shape spacing vertices",
-    "regions": "interfaces region regions shapes",
+    "regions": "interfaces lattice region regions shapes",
     "choosing": "basis_terms d depth formulation h kernel method order radius size stencils",
     "time": "damping save scheme steps t",
     "modes": "count mass near",
@@ -66,6 +69,11 @@ PAGES = {
     "gradients": "objective optimizer parameters",
     "pictures": "ax at mesh path polygon tags",
 }
+PACKAGES = {
+    "adaptation": "adaptivity", "cloud": "clouds", "equation": "problems", "evolution": "time", "modes": "modes",
+    "parallel": "parallel", "particle": "choosing", "show": "pictures", "tuning": "gradients",
+}  # fmt: skip
+_PLACE = re.compile(r" \(docs: [\w#/-]+\)")
 _LONGEST = 200  # letters of a value that a message quotes
 
 
@@ -117,37 +125,47 @@ def explained(flags: Iterable[str]) -> list[str]:
 
 
 class _Explaining(ContextDecorator):
-    """``@explaining``: what this public function refuses ends with the place in the documentation that helps."""
+    """``@explaining``: what this public function refuses ends with the place in the documentation that helps.
+
+    Functions that stand in a user's residuals have it in their messages instead: there this would be one more frame
+    between the user's line and what is recorded of it.
+    """
 
     def __enter__(self) -> None: ...
 
     def __exit__(self, kind: Any, error: BaseException | None, trace: TracebackType | None) -> None:
-        if isinstance(error, SolveError) or isinstance(error, ValueError) and _own(trace):
-            error.args = (placed(str(error)), *error.args[1:])
+        package = _package(trace)
+        if isinstance(error, SolveError) or isinstance(error, (ValueError, ImportError)) and package is not None:
+            error.args = (placed(str(error), package or ""), *error.args[1:])
 
 
 explaining = _Explaining()
 
 
-def _own(trace: TracebackType | None) -> bool:
-    """Whether an error was raised in this package, not in a user's function or another library."""
+def _package(trace: TracebackType | None) -> str | None:
+    """The package in which an error was raised; None in a user's function or another library."""
     while trace is not None and trace.tb_next is not None:
         trace = trace.tb_next
-    return trace is not None and str(trace.tb_frame.f_globals.get("__name__")).startswith("jsmitsm.")
+    of, _, rest = ("" if trace is None else str(trace.tb_frame.f_globals.get("__name__"))).partition(".")
+    return rest.partition(".")[0] if of == "jsmitsm" else None
 
 
-def placed(message: str) -> str:
-    """An error's message with the place in the documentation.
+def placed(message: str, package: str = "") -> str:
+    """An error's message that ends with the place in the documentation; a message quoted in it may have one already.
 
     >>> placed("pde: expected a function, got 3"), placed("tol: expected a number")
     ('pde: expected a function, got 3 (docs: problems)', 'tol: expected a number (docs: symptoms#errors)')
+    >>> placed("count: 1 is too few", "show"), placed("pde: fails: the order is 3 (docs: time); write 2")
+    ('count: 1 is too few (docs: pictures)', 'pde: fails: the order is 3; write 2 (docs: time)')
     """
-    if "(docs: " in message:
-        return message
-    place = next((name for words, name in REFUSALS.items() if words in message), None)
+    if inner := _PLACE.search(message):
+        return _PLACE.sub("", message) + inner[0]
+    if place := next((f"symptoms#{name}" for words, name in REFUSALS.items() if words in message), None):
+        return f"{message} (docs: {place})"
     argument = re.match(r"\w*", message)
-    page = next((page for page, names in PAGES.items() if argument and argument[0] in names.split()), "symptoms#errors")
-    return f"{message} (docs: {f'symptoms#{place}' if place else page})"
+    asked = argument[0] if argument and package != "show" else ""
+    known = next((page for page, names in PAGES.items() if asked in names.split()), None)
+    return f"{message} (docs: {known or PACKAGES.get(package, 'symptoms#errors')})"
 
 
 def some(index: Any, most: int = 6) -> str:
@@ -224,6 +242,20 @@ def refuse_masked(value: Any, name: str) -> None:
             f"{name}: {hidden.sum()} of its {hidden.size} entries are masked, as {first}; fill them (np.ma.filled) or "
             "drop them"
         )
+
+
+def numbers(name: str, value: Any) -> np.ndarray:
+    """A value as an array of floats, refused in words where it is none.
+
+    >>> numbers("parameters", "ab")
+    Traceback (most recent call last):
+      ...
+    ValueError: parameters: expected numbers, got 'ab'
+    """
+    try:
+        return np.asarray(value, float)
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError(f"{name}: expected numbers, got {short(value)}") from None
 
 
 def is_whole(value: Any, least: float = -np.inf, most: float = np.inf) -> bool:

@@ -325,7 +325,7 @@ def _impl(*arguments: Any, program: Program) -> list[Any]:
     out = jax.tree.leaves(program.run(*arguments))
     if program.on_host:
         avals = program.result(_avals(arguments)).avals
-        return [jnp.asarray(np.asarray(x, a.dtype)) for x, a in zip(out, avals, strict=True)]
+        return [jax.device_put(np.asarray(x, a.dtype)) for x, a in zip(out, avals, strict=True)]
     return out
 
 

@@ -62,8 +62,8 @@ def real(name: str, numbers: Any) -> np.ndarray:
     return array.astype(float)
 
 
-def panels(given: Any, count: int, size: tuple[float, float], rows: bool = False) -> np.ndarray:
-    """An array of ``count`` axes: the given ones, or a row or column in a new figure."""
+def panels(given: Any, count: int, size: tuple[float, float], rows: bool = False, solid: bool = False) -> np.ndarray:
+    """An array of ``count`` axes: the given ones, or a row or column in a new figure, three-dimensional if asked."""
     if given is not None:
         if np.size(given) != count:
             raise ValueError(f"ax: this picture has {count} panel(s), {np.size(given)} axes came; pass {count}")
@@ -71,7 +71,9 @@ def panels(given: Any, count: int, size: tuple[float, float], rows: bool = False
             _check_axes(one)
         return np.atleast_1d(np.asarray(given, dtype=object)).ravel()
     shape, both = ((count, 1), (size[0], size[1] * count)) if rows else ((1, count), (size[0] * count, size[1]))
-    return pyplot().subplots(*shape, figsize=both, layout="constrained", squeeze=False, sharex=rows)[1].ravel()
+    kind = {"projection": "3d"} if solid else {}
+    more: dict[str, Any] = {"layout": "constrained", "squeeze": False, "sharex": rows, "subplot_kw": kind}
+    return pyplot().subplots(*shape, figsize=both, **more)[1].ravel()
 
 
 def rows_of(given: Any, count: int, wide: int, size: tuple[float, float]) -> np.ndarray:
@@ -120,6 +122,11 @@ def field_of(numbers: Any, field: int) -> np.ndarray:
     if not isinstance(field, (int, np.integer)) or not 0 <= field < array.shape[1]:
         raise ValueError(f"field: {field!r}, but the solution has fields 0 to {array.shape[1] - 1}")
     return array[:, field]
+
+
+def name_of(sol: Solution, field: int, label: str | None = None) -> str:
+    """What a field is called: as the user says, else as it is written."""
+    return label or ("u" if np.ndim(sol.u) == 1 else f"u[{field}]")
 
 
 def at_points(function: Callable, points: np.ndarray) -> np.ndarray:

@@ -97,6 +97,7 @@ def _tag_key(tags: Any) -> tuple[str | None, list[str] | None]:
     raise ValueError(f"tags: expected the name of cell data, or a list of the names of groups, got {tags!r}")
 
 
+@explaining
 def from_shapely(polygon: Any, spacing: Any, seed: int = 0, groups: Any = None) -> Cloud:
     """Particles of a shapely ``Polygon`` with its holes; see ``js.from_polygon``.
 
@@ -141,6 +142,7 @@ def from_shapely(polygon: Any, spacing: Any, seed: int = 0, groups: Any = None) 
     return from_polygon(np.asarray(polygon.exterior.coords)[:, :2], spacing, holes=holes, seed=seed, groups=groups)
 
 
+@explaining
 def to_mesh(sol: Solution, **more: Any) -> Any:
     """The solution on a mesh of triangles (lines, tetrahedra) between its particles; holes stay open.
 

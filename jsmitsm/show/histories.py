@@ -9,11 +9,13 @@ import numpy as np
 
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.cloud.neighbours import Stencils
+from jsmitsm.runtime.errors import explaining, numbers
 from jsmitsm.show import drawing
 from jsmitsm.show.drawing import COLOURS, MARKERS
 from jsmitsm.solution.solution import Solution
 
 
+@explaining
 def sparsity(what: Any, *, ax: Any = None) -> Any:
     """Which particles each particle looks at, as a matrix: row i has a dot for every neighbour of particle i.
 
@@ -42,7 +44,12 @@ def sparsity(what: Any, *, ax: Any = None) -> Any:
     else:
         from scipy.sparse import coo_matrix
 
-        matrix = coo_matrix(what)
+        try:
+            matrix = coo_matrix(what)
+        except (TypeError, ValueError):
+            raise ValueError(
+                f"what: expected js.Stencils, a js.Solution or a matrix, got {type(what).__name__}"
+            ) from None
         rows, columns, shape = matrix.row, matrix.col, matrix.shape
         names = ("column", "row")
     ax = drawing.axes(ax, 2)
@@ -56,6 +63,7 @@ def sparsity(what: Any, *, ax: Any = None) -> Any:
     return ax
 
 
+@explaining
 def tuning(result: Any, *, ax: Any = None) -> Any:
     """The history of a tuning: the objective and every parameter over the steps.
 
@@ -87,11 +95,11 @@ def tuning(result: Any, *, ax: Any = None) -> Any:
     history = getattr(result, "history", result)
     if not isinstance(history, (Mapping, list, tuple)) or not len(history):
         raise ValueError(f"result: expected what js.tune returned or its history, got {type(result).__name__}")
-    if not isinstance(history, Mapping):  # one record per step
+    if not isinstance(history, Mapping) and all(isinstance(step, Mapping) for step in history):  # one record per step
         history = {name: [step[name] for step in history] for name in history[0]}
-    if "objective" not in history:
+    if not isinstance(history, Mapping) or "objective" not in history:
         raise ValueError(f'history: has {list(history)} but no "objective"; pass what js.tune returned')
-    panels = {"objective": np.asarray(history["objective"], dtype=float)}
+    panels = {"objective": numbers("objective", history["objective"])}
     for name, track in history.items():
         if name != "objective":
             panels |= drawing.tracks(name, track, len(panels["objective"]))
@@ -114,6 +122,7 @@ def tuning(result: Any, *, ax: Any = None) -> Any:
     return axes
 
 
+@explaining
 def convergence(spacing: Any, errors: Any, *, floor: float = 1e-13, xlabel: str = "spacing", ylabel: str = "error",
                 ax: Any = None) -> Any:  # fmt: skip
     """Errors against the spacing on logarithmic axes, the observed order written on every line.
@@ -149,12 +158,12 @@ def convergence(spacing: Any, errors: Any, *, floor: float = 1e-13, xlabel: str 
     >>> [text.get_text() for text in ax.texts]
     ['order 4.00']
     """
-    spacing = np.asarray(spacing, dtype=float)
+    spacing = numbers("spacing", spacing)
     lines = errors if isinstance(errors, Mapping) else {"": errors}
     ax = drawing.axes(ax, 1)
     ends = []
     for k, (name, values_) in enumerate(lines.items()):
-        y = np.asarray(values_, dtype=float)
+        y = numbers("errors", values_)
         if y.shape != spacing.shape or y.ndim != 1 or len(y) < 2 or not (y > 0).all() or not (spacing > 0).all():
             raise ValueError(
                 f"errors{f'[{name!r}]' if name else ''}: expected {spacing.shape} positive numbers like spacing and at "
@@ -176,6 +185,7 @@ def convergence(spacing: Any, errors: Any, *, floor: float = 1e-13, xlabel: str 
     return ax
 
 
+@explaining
 def adaptation(found: Any, *, ax: Any = None) -> np.ndarray:
     """What ``js.adapt`` did, in three panels: spacings, the estimated error, and the rounds.
 

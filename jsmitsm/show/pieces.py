@@ -29,27 +29,29 @@ class Piece(NamedTuple):
     outline: list[np.ndarray]  # loops (V, 2), holes the other way round; none where nothing but the particles is known
 
 
-def pieces(cloud: Cloud, numbers: np.ndarray, anywhere: Callable | None, axis: int = -1, position: float = 0.0
-           ) -> list[Piece]:  # fmt: skip
+def pieces(cloud: Cloud, numbers: np.ndarray, anywhere: Callable | None, axis: int = -1, position: float = 0.0,
+           outlined: bool = True) -> list[Piece]:  # fmt: skip
     """What is drawn of a 2D domain, or where a plane across ``axis`` cuts a 3D one: a piece for each region, so that
     jumps stay sharp.
 
-    numbers (N,) or (N, F): values at the particles; anywhere: the same at any points, None where nobody knows.
+    numbers (N,) or (N, F): values at the particles; anywhere: the same at any points, None where nobody knows; not
+    outlined are slices that end where the facets between the particles do.
     """
     if not isinstance(cloud, RegionCloud):
-        return [_piece(cloud, numbers, anywhere, axis, position)]
+        return [_piece(cloud, numbers, anywhere, axis, position, outlined)]
     out = []
     for name, ids in cloud.regions.items():
         part, own = cloud.region(name), None if anywhere is None else partial(anywhere, region=name)
         reach = np.asarray(part.points)[:, axis]
         if axis < 0 or reach.min() < position < reach.max():
-            out.append(_piece(part, numbers[ids], own, axis, position))
-    return out or [_piece(cloud.region(next(iter(cloud.regions))), numbers, anywhere, axis, position)]
+            out.append(_piece(part, numbers[ids], own, axis, position, outlined))
+    return out or [_piece(cloud.region(next(iter(cloud.regions))), numbers, anywhere, axis, position, outlined)]
 
 
-def _piece(cloud: Cloud, numbers: np.ndarray, anywhere: Callable | None, axis: int, position: float) -> Piece:
+def _piece(cloud: Cloud, numbers: np.ndarray, anywhere: Callable | None, axis: int, position: float, outlined: bool
+           ) -> Piece:  # fmt: skip
     points = np.asarray(cloud.points, dtype=float)
-    loops = outline(cloud, axis, position)
+    loops = outline(cloud, axis, position) if outlined else []
     kept = [k for k in range(cloud.dim) if k != axis]
     if anywhere is None:
         if axis < 0:
@@ -66,8 +68,21 @@ def _piece(cloud: Cloud, numbers: np.ndarray, anywhere: Callable | None, axis: i
     places, cells = _refined(places, cells)
     there = places if axis < 0 else np.insert(places, axis, position, axis=1)
     # The particles keep the values that were solved for, held ones among them.
-    fine = np.asarray(anywhere(there[given:]))
+    fine = _believed(cloud, points, numbers, there[given:], np.asarray(anywhere(there[given:])))
     return Piece(places, cells, np.concatenate([numbers, fine]) if given else fine, loops)
+
+
+def _believed(cloud: Cloud, points: np.ndarray, numbers: np.ndarray, places: np.ndarray, values: np.ndarray
+              ) -> np.ndarray:  # fmt: skip
+    """Values between the particles, near the boundary none beyond those at all particles: a peak may lie between two of
+    them, but what a polynomial adds to values held on a boundary, round a corner most of all, is its own."""
+    from scipy.spatial import cKDTree
+
+    near = cKDTree(points).query(places, k=min(2 * cloud.dim, len(points)))[1]
+    rim = np.zeros(len(points), bool)
+    rim[cloud.boundary] = True
+    within = np.clip(values, numbers.min(axis=0), numbers.max(axis=0))
+    return np.where(rim[near].any(axis=1).reshape(-1, *(1,) * (values.ndim - 1)), within, values)
 
 
 def _refined(places: np.ndarray, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

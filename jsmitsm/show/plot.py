@@ -18,11 +18,12 @@ from jsmitsm.cloud.neighbours import Stencils
 from jsmitsm.cloud.regions.region_cloud import RegionCloud
 from jsmitsm.cloud.triangulation import simplices
 from jsmitsm.particle.kernels import Kernel
+from jsmitsm.runtime.errors import explaining
 from jsmitsm.show import drawing
 from jsmitsm.show.drawing import COLOURS, GREY, MARKERS
 from jsmitsm.show.histories import adaptation, convergence, sparsity, tuning
 from jsmitsm.show.series import animate
-from jsmitsm.show.solid import solid
+from jsmitsm.show.solid import solid, solids
 from jsmitsm.show.vectors import deformed, names_of, principal, streamlines, vectors
 from jsmitsm.solution.solution import Solution
 
@@ -30,6 +31,7 @@ __all__ = ["adaptation", "animate", "cloud", "convergence", "deformed", "error",
            "solid", "solution", "sparsity", "streamlines", "tuning", "values", "vectors"]  # fmt: skip
 
 
+@explaining
 def cloud(what: Cloud | Solution, *, normals: bool = False, support: int | None = None, kernel: Kernel | None = None,
           stencils: Stencils | None = None, legend: bool = True, ax: Any = None) -> Any:  # fmt: skip
     """The particles of a cloud, coloured by group; 1D, 2D or 3D.
@@ -97,8 +99,9 @@ def cloud(what: Cloud | Solution, *, normals: bool = False, support: int | None 
     return ax
 
 
+@explaining
 def solution(sol: Solution, *, field: int = 0, exact: Any = None, at: Mapping[str, float] | None = None,
-             levels: int = 20, colorbar: bool = True, ax: Any = None) -> Any:  # fmt: skip
+             levels: int = 20, colorbar: bool = True, label: str | None = None, ax: Any = None) -> Any:  # fmt: skip
     """A solution: a curve in 1D, filled contours over the true shape in 2D, slices in 3D.
 
     Between the particles the local polynomials are drawn, not straight lines.
@@ -117,6 +120,8 @@ def solution(sol: Solution, *, field: int = 0, exact: Any = None, at: Mapping[st
         About how many contour levels.
     colorbar : bool
         Draw one, for 2D and 3D.
+    label : str, optional
+        What is drawn, with its unit, ``"temperature (K)"``; ``u`` or ``u[k]`` if not given.
     ax : Axes or array of Axes, optional
         Axes; in 3D one for every slice.
 
@@ -138,17 +143,15 @@ def solution(sol: Solution, *, field: int = 0, exact: Any = None, at: Mapping[st
     >>> problem = js.Problem(lambda u, x: js.laplacian(u)(x) + 1.0, ends)
     >>> ax = js.plot.solution(js.solve(problem, js.interval(0.0, 1.0, 9)))
     """
-    if not isinstance(sol, Solution):
-        raise ValueError(f"sol: expected a js.Solution, got {type(sol).__name__}; plain numbers are for js.plot.values")
-    sol.refuse_stacked()
+    _of(sol).refuse_stacked()
     numbers = drawing.field_of(sol.u, field)
 
     def anywhere(points, **side):
         return drawing.field_of(sol(points, blend=True, outside="extrapolate", **side), field)
 
-    label = "u" if np.ndim(sol.u) == 1 else f"u[{field}]"
+    name = drawing.name_of(sol, field, label)
     if sol.cloud.dim > 1:
-        return drawing.maps(sol.cloud, numbers, anywhere, at, levels, colorbar, ax, label, log=False)
+        return drawing.maps(sol.cloud, numbers, anywhere, at, levels, colorbar, ax, name, log=False)
     ax = drawing.axes(ax, 1)
     lines, heights = [], []
     for part, side in _regions(sol.cloud):
@@ -157,16 +160,17 @@ def solution(sol: Solution, *, field: int = 0, exact: Any = None, at: Mapping[st
         heights.append(np.reshape(anywhere(lines[-1].reshape(-1, 1), **side), lines[-1].shape))
     line, height = np.concatenate(lines), np.concatenate(heights)
     # One NaN after every piece: where the domain has a gap the curve has one.
-    ax.plot(drawing.gapped(line), drawing.gapped(height), color=COLOURS[0], label=label)
+    ax.plot(drawing.gapped(line), drawing.gapped(height), color=COLOURS[0], label=name)
     ax.plot(np.asarray(sol.cloud.points)[:, 0], numbers, "o", color=COLOURS[0], markersize=4)
     if exact is not None:
         truth = drawing.at_points(exact, line.reshape(-1, 1)).reshape(line.shape)
         ax.plot(drawing.gapped(line), drawing.gapped(truth), "--", color="k", linewidth=1, label="exact")
         ax.legend(frameon=False)
-    drawing.labels(ax, "x", label)
+    drawing.labels(ax, "x", name)
     return ax
 
 
+@explaining
 def fields(sol: Solution, *, names: Sequence[str] | None = None, ax: Any = None, **options: Any) -> Any:
     """Every field of a system, side by side.
 
@@ -175,16 +179,16 @@ def fields(sol: Solution, *, names: Sequence[str] | None = None, ax: Any = None,
     sol : Solution
         Of a system.
     names : sequence of str, optional
-        One for every field, written above; ``u[0]``, ``u[1]``, ... if not given.
+        One for every field, with its unit; ``u[0]``, ``u[1]``, ... if not given.
     ax : array of Axes, optional
         As many as there are panels.
     **options : optional
-        As in ``js.plot.solution``.
+        As in ``js.plot.solution``; in 3D ``cut`` and ``engine`` as in ``js.plot.solid``, which then draws the fields.
 
     Returns
     -------
-    array of Axes
-        One a field; in 3D a row of slices for each.
+    array of Axes or pyvista.Plotter
+        One a field; in 3D a row of slices for each, or with ``cut`` or ``engine`` a solid.
 
     Raises
     ------
@@ -200,11 +204,11 @@ def fields(sol: Solution, *, names: Sequence[str] | None = None, ax: Any = None,
     >>> beam = js.solve(js.Problem(pde, ends, fields=2), js.interval(0.0, 1.0, 9))
     >>> axes = js.plot.fields(beam, names=["deflection", "moment"])
     """
-    if not isinstance(sol, Solution):
-        raise ValueError(f"sol: expected a js.Solution, got {type(sol).__name__}; plain numbers are for js.plot.values")
-    sol.refuse_stacked()
+    _of(sol).refuse_stacked()
     count = 1 if np.ndim(sol.u) == 1 else sol.u.shape[1]
     titles = names_of(names, count)
+    if sol.cloud.dim == 3 and ("cut" in options or "engine" in options):
+        return solids(sol, titles, ax=ax, **options)
     if sol.cloud.dim == 3:
         slices = 3 if options.get("at") is None else len(options["at"])
         axes = drawing.rows_of(ax, count, slices, (3.6, 3.4))
@@ -212,12 +216,18 @@ def fields(sol: Solution, *, names: Sequence[str] | None = None, ax: Any = None,
         width, height = drawing.page(np.asarray(sol.cloud.points)) if sol.cloud.dim == 2 else (4.6, 3.4)
         axes = drawing.panels(ax, count, (width, height))
     for k, (one, title) in enumerate(zip(axes, titles)):
-        solution(sol, field=k, ax=one, **options)
+        solution(sol, field=k, ax=one, label=title, **options)
         if sol.cloud.dim < 3:
             one.set_title(title, fontsize="medium")
         else:
             one[0].set_title(f"{title}, {one[0].get_title()}", fontsize="medium")
     return axes
+
+
+def _of(sol: Any) -> Solution:
+    if not isinstance(sol, Solution):
+        raise ValueError(f"sol: expected a js.Solution, got {type(sol).__name__}; plain numbers are for js.plot.values")
+    return sol
 
 
 def _regions(cloud: Cloud) -> list[tuple[Cloud, dict[str, str]]]:
@@ -227,6 +237,7 @@ def _regions(cloud: Cloud) -> list[tuple[Cloud, dict[str, str]]]:
     return [(cloud, {})]
 
 
+@explaining
 def values(cloud: Cloud, numbers: Any, *, log: bool = False, label: str = "", at: Mapping[str, float] | None = None,
            levels: int = 20, colorbar: bool = True, ax: Any = None) -> Any:  # fmt: skip
     """Any numbers at the particles as a map.
@@ -280,6 +291,7 @@ def values(cloud: Cloud, numbers: Any, *, log: bool = False, label: str = "", at
     return ax
 
 
+@explaining
 def error(sol: Solution, exact: Any, *, field: int = 0, log: bool = True, ax: Any = None, **options: Any) -> Any:
     """The error |u - exact| at the particles.
 
@@ -312,7 +324,7 @@ def error(sol: Solution, exact: Any, *, field: int = 0, log: bool = True, ax: An
     ...                      {"left": js.dirichlet(0.0), "right": js.dirichlet(1.0)})
     >>> ax = js.plot.error(js.solve(problem, js.interval(0.0, 1.0, 9), order=2), lambda x: x[0] ** 4)
     """
-    sol.refuse_stacked()
+    _of(sol).refuse_stacked()
     truth = drawing.at_points(exact, np.asarray(sol.cloud.points)) if callable(exact) else exact
     truth = drawing.field_of(drawing.real("exact", truth), field)
     if truth.shape != (len(sol.cloud),):
@@ -321,6 +333,7 @@ def error(sol: Solution, exact: Any, *, field: int = 0, log: bool = True, ax: An
     return values(sol.cloud, numbers, log=log, ax=ax, **{"label": "error"} | options)
 
 
+@explaining
 def estimate(sol: Solution, *, field: int = 0, log: bool = True, ax: Any = None, **options: Any) -> Any:
     """The estimated error at the particles, ``js.Solution.error_estimate``, as a map.
 
@@ -346,5 +359,5 @@ def estimate(sol: Solution, *, field: int = 0, log: bool = True, ax: Any = None,
     ...                      {"left": js.dirichlet(0.0), "right": js.dirichlet(1.0)})
     >>> ax = js.plot.estimate(js.solve(problem, js.interval(0.0, 1.0, 9), order=2))
     """
-    numbers = np.abs(drawing.field_of(sol.error_estimate(), field))
+    numbers = np.abs(drawing.field_of(_of(sol).error_estimate(), field))
     return values(sol.cloud, numbers, log=log, ax=ax, **{"label": "estimated error"} | options)

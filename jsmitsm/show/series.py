@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 
 from jsmitsm.cloud.triangulation import simplices
-from jsmitsm.runtime.errors import is_whole
+from jsmitsm.runtime.errors import explaining, is_whole
 from jsmitsm.show import drawing
 from jsmitsm.show.mesh_files import needed
 
 
+@explaining
 def animate(run: Any, *, field: int = 0, frames: int | None = None, interval: float = 50.0, ax: Any = None) -> Any:
     """An evolution as a ``matplotlib.animation.FuncAnimation``: a curve in 1D, colours over the cloud in 2D.
 
@@ -88,6 +89,7 @@ def animate(run: Any, *, field: int = 0, frames: int | None = None, interval: fl
     return FuncAnimation(ax.figure, show, frames=len(times), interval=interval)
 
 
+@explaining
 def to_pvd(run: Any, path: Any) -> None:
     """Write an evolution as a series for ParaView: ``path`` (.pvd) lists the saved times, a .vtu file each beside it.
 

@@ -1,23 +1,28 @@
-"""Solids: their surface in colours, opened by a cut. By pyvista where it is installed, else by matplotlib."""
+"""Solids: their surface in colours, opened by a cut. By pyvista where it is installed, else by matplotlib.
+
+What is drawn are triangles with values at their corners, the same for both. A stage is what they are drawn on:
+matplotlib's axes, or a plotter of pyvista's.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from jsmitsm.cloud.cloud import Cloud
-from jsmitsm.cloud.triangulation import boundary_facets, simplices
+from jsmitsm.cloud.triangulation import boundary_facets
+from jsmitsm.runtime.errors import explaining
 from jsmitsm.show import drawing
-from jsmitsm.show.pieces import AXES, pieces
+from jsmitsm.show.pieces import pieces
 from jsmitsm.solution.solution import Solution
 
 _ENGINES = ("auto", "pyvista", "matplotlib")
 
 
-def solid(sol: Solution, *, field: int = 0, cut: Mapping[str, float] | None = None, engine: str = "auto",
-          ax: Any = None) -> Any:  # fmt: skip
+@explaining
+def solid(sol: Solution, *, field: int = 0, cut: Mapping[str, float] | None = None, label: str | None = None,
+          engine: str = "auto", ax: Any = None) -> Any:  # fmt: skip
     """The surface of a solid, coloured by the solution, opened by cuts.
 
     Parameters
@@ -28,6 +33,8 @@ def solid(sol: Solution, *, field: int = 0, cut: Mapping[str, float] | None = No
         The field of a system.
     cut : mapping, optional
         From an axis to a position, ``{"x": 0.0}``: what lies beyond is taken away, and the section shows.
+    label : str, optional
+        What the colours are, with its unit, ``"temperature (K)"``; ``u`` or ``u[k]`` if not given.
     engine : {"auto", "pyvista", "matplotlib"}
         What draws. "auto" is pyvista (``pip install "jsmitsm[solid]"``) where it is installed and no ``ax`` is given.
     ax : Axes, optional
@@ -58,38 +65,120 @@ def solid(sol: Solution, *, field: int = 0, cut: Mapping[str, float] | None = No
         raise ValueError(f"sol: expected a js.Solution, got {type(sol).__name__}")
     if sol.cloud.dim != 3:
         raise ValueError(f"sol: a solid has three dimensions, this solution {sol.cloud.dim}; take js.plot.solution")
+    sol.refuse_stacked()
+    on = stage(engine, ax)
+    _opened(on, sol, field, cut, drawing.name_of(sol, field, label))
+    return on
+
+
+def solids(sol: Solution, titles: Sequence[str], cut: Any = None, engine: str = "auto", ax: Any = None) -> Any:
+    """Every field of a solid in a panel of its own: one plotter, or an array of axes."""
+    made = None if ax is not None else _pyvista(engine)
+    if made is not None:
+        plotter = _plotter(made, shape=(1, len(titles)), window_size=(640 * len(titles), 640))
+        for k, title in enumerate(titles):
+            plotter.subplot(0, k)
+            _opened(plotter, sol, k, cut, title)
+        return plotter
+    axes = drawing.panels(ax, len(titles), (6.0, 4.8), solid=True)
+    for k, (one, title) in enumerate(zip(axes, titles)):
+        _opened(drawing.axes(one, 3), sol, k, cut, title)
+    return axes
+
+
+def stage(engine: str, ax: Any = None) -> Any:
+    """What a solid is drawn on: the axes given, a plotter, or new axes."""
+    made = _pyvista(engine) if ax is None else None
+    return drawing.axes(ax, 3, (6.0, 4.8)) if made is None else _plotter(made)
+
+
+def _pyvista(engine: str) -> Any:
+    """pyvista, or None where it is not asked for or not there."""
     if engine not in _ENGINES:
         raise ValueError(f"engine: expected one of {', '.join(map(repr, _ENGINES))}, got {engine!r}")
-    sol.refuse_stacked()
+    if engine == "matplotlib":
+        return None
+    try:
+        import pyvista
+    except ImportError:
+        if engine == "pyvista":
+            raise ImportError('engine: pyvista is an optional extra: pip install "jsmitsm[solid]"') from None
+        return None
+    return pyvista
+
+
+def _plotter(pyvista: Any, **panels: Any) -> Any:
+    return pyvista.Plotter(off_screen=pyvista.OFF_SCREEN or None, **panels)
+
+
+def is_plotter(on: Any) -> bool:
+    """Whether a stage is pyvista's."""
+    return hasattr(on, "add_mesh")
+
+
+def _opened(on: Any, sol: Solution, field: int, cut: Mapping[str, float] | None, label: str) -> None:
+    """The surface of a solid and its sections, on a stage."""
     numbers = drawing.field_of(sol.u, field)
-    label = "u" if np.ndim(sol.u) == 1 else f"u[{field}]"
     where = {} if cut is None else dict(drawing.places(sol.cloud, cut))
-    made = _pyvista(engine) if ax is None and engine != "matplotlib" else None
-    if made is not None:
-        return _plotter(made, sol.cloud, numbers, where, label)
 
     def anywhere(points: np.ndarray, **side: str) -> np.ndarray:
         return drawing.field_of(sol(points, blend=True, outside="extrapolate", **side), field)
 
-    ax = drawing.axes(ax, 3, (6.0, 4.8))
-    points = np.asarray(sol.cloud.points, float)
     facets = boundary_facets(sol.cloud)[0]
-    corners, shades = points[facets], numbers[facets]
+    corners, shades = np.asarray(sol.cloud.points, float)[facets], numbers[facets]
     for axis, position in where.items():
         corners, shades = _kept(corners, shades, axis, position)
     for axis, position in where.items():
-        for one in pieces(sol.cloud, numbers, anywhere, axis, position):
+        for one in pieces(sol.cloud, numbers, anywhere, axis, position, outlined=False):
             section = np.insert(one.places, axis, position, axis=1)[one.triangles], one.values[one.triangles]
             for other, limit in where.items():
                 section = section if other == axis else _kept(*section, other, limit)
             corners, shades = (np.concatenate(both) for both in zip((corners, shades), section))
-    faces(ax, corners, shades.mean(axis=1), label)
-    ax.view_init(40 if 2 in where else 28, {(0,): -30, (1,): 60, (0, 1): 45}.get(tuple(sorted({*where} - {2})), -60))
-    drawing.dress(ax, 3)
-    return ax
+    faces(on, corners, shades, label)
+    if not is_plotter(on):
+        turned = {(0,): -30, (1,): 60, (0, 1): 45}.get(tuple(sorted({*where} - {2})), -60)
+        on.view_init(40 if 2 in where else 28, turned)
+    furnish(on)
 
 
-def faces(ax: Any, corners: np.ndarray, shades: np.ndarray, label: str) -> None:
+def furnish(on: Any) -> None:
+    """Names of the axes, and a view from a corner."""
+    if not is_plotter(on):
+        drawing.dress(on, 3)
+        return
+    on.show_grid(xtitle="x", ytitle="y", ztitle="z", color="grey", n_xlabels=3, n_ylabels=3, n_zlabels=3)
+    on.view_isometric()
+    on.camera.zoom(0.75)  # the bar lies below
+
+
+def faces(on: Any, corners: np.ndarray, shades: np.ndarray, label: str) -> None:
+    """Triangles (T, 3, 3) on a stage, coloured by numbers (T, 3) at their corners, with a colour bar."""
+    if not is_plotter(on):
+        _painted(on, corners, shades.mean(axis=1), label)
+        return
+    body = surface(corners)
+    body.point_data[label] = shades.ravel()
+    on.add_mesh(body, scalars=label, cmap="viridis", scalar_bar_args=bar(label), **LIGHT)
+
+
+# VTK's own light leaves a section in the dark.
+LIGHT = {"ambient": 0.45, "diffuse": 0.6}
+
+
+def bar(label: str) -> dict[str, Any]:
+    """How pyvista draws a colour bar: lying, where a long name with its unit has room, an empty line below it."""
+    return {"title": f"{label}\n", "fmt": "%.3g", "vertical": False, "position_x": 0.2, "position_y": 0.02,
+            "width": 0.6, "height": 0.09, "title_font_size": 16, "label_font_size": 14}  # fmt: skip
+
+
+def surface(corners: np.ndarray) -> Any:
+    """Triangles (T, 3, 3) as pyvista's mesh, with every corner for itself."""
+    import pyvista
+
+    return pyvista.PolyData.from_regular_faces(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3))
+
+
+def _painted(ax: Any, corners: np.ndarray, shades: np.ndarray, label: str) -> None:
     """Triangles (T, 3, 3) in three-dimensional axes, coloured by numbers (T,), with a colour bar."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
@@ -122,32 +211,3 @@ def _kept(corners: np.ndarray, shades: np.ndarray, axis: int, position: float) -
             made = np.stack(triangle, axis=1)
             out.append((made[:, :, :3], made[:, :, 3]))
     return np.concatenate([x for x, _ in out]), np.concatenate([z for _, z in out])
-
-
-def _pyvista(engine: str) -> Any:
-    try:
-        import pyvista
-    except ImportError:
-        if engine == "pyvista":
-            raise ImportError('engine: pyvista is an optional extra: pip install "jsmitsm[solid]"') from None
-        return None
-    return pyvista
-
-
-def _plotter(pyvista: Any, cloud: Cloud, numbers: np.ndarray, where: dict[int, float], label: str) -> Any:
-    """A plotter with the tetrahedra between the particles, cut by planes."""
-    cells = simplices(cloud)
-    padded = np.concatenate([np.full((len(cells), 1), 4), cells], axis=1).ravel()
-    points = np.asarray(cloud.points, float)
-    grid = pyvista.UnstructuredGrid(padded, np.full(len(cells), pyvista.CellType.TETRA, np.uint8), points)
-    grid.point_data[label] = numbers
-    for axis, position in where.items():
-        grid = grid.clip(normal=AXES[axis], origin=np.eye(3)[axis] * position)
-    plotter = pyvista.Plotter(off_screen=pyvista.OFF_SCREEN or None)
-    # VTK's title lies on its bar's numbers without an empty line; its light alone leaves a section in the dark.
-    bar = {"title": f"{label}\n", "fmt": "%.3g", "vertical": True, "position_x": 0.9, "position_y": 0.2, "height": 0.6}
-    plotter.add_mesh(grid, scalars=label, cmap="viridis", ambient=0.45, diffuse=0.6, scalar_bar_args=bar)
-    plotter.show_grid(xtitle="x", ytitle="y", ztitle="z", color="grey", n_xlabels=3, n_ylabels=3, n_zlabels=3)
-    plotter.view_isometric()
-    plotter.camera.zoom(0.85)  # the bar stands at its side
-    return plotter

@@ -11,13 +11,14 @@ import numpy as np
 
 from jsmitsm.cloud.cloud import INTERIOR, Cloud
 from jsmitsm.cloud.regions.region_cloud import RegionCloud
-from jsmitsm.runtime.errors import refuse_masked
+from jsmitsm.runtime.errors import explaining, refuse_masked
 from jsmitsm.show.mesh_files import needed
 from jsmitsm.solution.solution import Solution
 
 _AXES = "xyz"
 
 
+@explaining
 def from_csv(path: Any) -> Cloud:
     """A cloud from a CSV file with a header; ``js.files.to_csv`` writes such files.
 
@@ -88,6 +89,7 @@ def from_csv(path: Any) -> Cloud:
     return Cloud(points, groups, _numbers(rows, normals, path) if normals[0] in header else None)
 
 
+@explaining
 def to_csv(what: Cloud | Solution, path: Any) -> None:
     """Write a cloud, or a solution with its cloud, as CSV: coordinates, group, normals and the values ``u``.
 
@@ -124,6 +126,7 @@ def to_csv(what: Cloud | Solution, path: Any) -> None:
         raise ValueError(f"path: cannot write {path!r} ({error}); give the path of a file in a folder") from None
 
 
+@explaining
 def to_pandas(what: Cloud | Solution, **more: Any) -> Any:
     """A cloud, or a solution with its cloud, as a table of one row per particle.
 
@@ -156,6 +159,7 @@ def to_pandas(what: Cloud | Solution, **more: Any) -> Any:
     return needed("pandas", "tables").DataFrame({**columns, **per_particle(more, len(columns["x"]), (1,), columns)})
 
 
+@explaining
 def to_xarray(sol: Solution, **more: Any) -> Any:
     """A solution as a data set over the dimension ``particle`` (and ``field`` for a system).
 

@@ -11,16 +11,19 @@ import numpy as np
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.cloud.regions.region_cloud import RegionCloud
 from jsmitsm.cloud.triangulation import boundary_facets
+from jsmitsm.runtime.errors import explaining
 from jsmitsm.show import drawing
 from jsmitsm.show.drawing import COLOURS
 from jsmitsm.show.pieces import Piece, clipped, outline, pieces
-from jsmitsm.show.solid import faces
+from jsmitsm.show.solid import LIGHT, bar, faces, furnish, is_plotter, stage, surface
 from jsmitsm.solution.solution import Solution
 
 _INK = "0.2"
 
 
-def vectors(sol: Solution, *, of: Callable | None = None, count: int = 20, ax: Any = None) -> Any:
+@explaining
+def vectors(sol: Solution, *, of: Callable | None = None, count: int = 20, label: str = "size", engine: str = "auto",
+            ax: Any = None) -> Any:  # fmt: skip
     """Arrows of a vector field, in 2D and 3D.
 
     Parameters
@@ -31,12 +34,16 @@ def vectors(sol: Solution, *, of: Callable | None = None, count: int = 20, ax: A
         Another field to draw, of points (M, D) -> (M, D): ``sol.grad``, or a flux made of it.
     count : int
         Arrows along the longest side of the domain; in 3D half as many.
+    label : str
+        What the colours of arrows in 3D are, with its unit.
+    engine : {"auto", "pyvista", "matplotlib"}
+        What draws in 3D, as in ``js.plot.solid``.
     ax : Axes, optional
         Where to draw; three-dimensional ones in 3D.
 
     Returns
     -------
-    Axes
+    Axes or pyvista.Plotter
         What it was drawn on.
 
     Raises
@@ -60,18 +67,43 @@ def vectors(sol: Solution, *, of: Callable | None = None, count: int = 20, ax: A
     points, arrows = points[seen], arrows[seen]
     longest = np.linalg.norm(arrows, axis=1).max(initial=0.0) or 1.0
     step = np.ptp(np.asarray(sol.cloud.points), axis=0).max() / (count if dim == 2 else max(2, count // 2))
-    ax = drawing.axes(ax, dim, drawing.page(np.asarray(sol.cloud.points)))
     shafts = arrows * (1.2 * step / longest)
     if dim == 3:
-        ax.quiver(*(points - shafts / 2).T, *shafts.T, color=COLOURS[0], linewidth=0.8)
-    else:
-        ax.quiver(*points.T, *shafts.T, angles="xy", scale_units="xy", scale=1, pivot="middle", color=_INK,
-                  units="dots", width=1.3)  # fmt: skip
-        _frame(ax, sol.cloud)
+        return _flying(stage(engine, ax), sol.cloud, points, arrows, shafts, label)
+    ax = drawing.axes(ax, dim, drawing.page(np.asarray(sol.cloud.points)))
+    ax.quiver(*points.T, *shafts.T, angles="xy", scale_units="xy", scale=1, pivot="middle", color=_INK,
+              units="dots", width=1.3)  # fmt: skip
+    _frame(ax, sol.cloud)
     drawing.dress(ax, dim)
     return ax
 
 
+def _flying(on: Any, cloud: Cloud, points: np.ndarray, arrows: np.ndarray, shafts: np.ndarray, label: str) -> Any:
+    """Arrows in space, coloured by their size, in the glass of the surface."""
+    size, tails = np.linalg.norm(arrows, axis=1), points - shafts / 2
+    skin = np.asarray(cloud.points, float)[boundary_facets(cloud)[0]]
+    if is_plotter(on):
+        on.add_mesh(surface(skin), color="grey", opacity=0.08)
+        from pyvista import Arrow, PolyData
+
+        dots = PolyData(tails)
+        dots.point_data["way"], dots.point_data["length"] = shafts, np.linalg.norm(shafts, axis=1)
+        dots.point_data[label] = size
+        arrow = Arrow(tip_length=0.35, tip_radius=0.14, shaft_radius=0.05)
+        on.add_mesh(dots.glyph(orient="way", scale="length", geom=arrow), scalars=label, cmap="viridis",
+                    scalar_bar_args=bar(label), **LIGHT)  # fmt: skip
+    else:
+        from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+
+        on.add_collection3d(Poly3DCollection(skin, facecolors="0.5", alpha=0.05))
+        drawn = on.quiver(*tails.T, *shafts.T, cmap="viridis", linewidth=0.9)
+        drawn.set_array(np.tile(size, 3))  # shafts, and both strokes of their heads
+        on.figure.colorbar(drawn, ax=on, label=label, shrink=0.7, pad=0.12, ticks=drawing.round_ticks())
+    furnish(on)
+    return on
+
+
+@explaining
 def streamlines(sol: Solution, *, of: Callable | None = None, density: float = 1.0, ax: Any = None) -> Any:
     """Stream lines of a vector field in 2D.
 
@@ -119,8 +151,9 @@ def streamlines(sol: Solution, *, of: Callable | None = None, density: float = 1
     return ax
 
 
+@explaining
 def deformed(sol: Solution, *, scale: float | None = None, colour: Callable | None = None, label: str = "displacement",
-             levels: int = 20, ax: Any = None) -> Any:  # fmt: skip
+             levels: int = 20, engine: str = "auto", ax: Any = None) -> Any:  # fmt: skip
     """The deformed shape of a body, of which the first D fields are displacements, in 2D and 3D.
 
     Parameters
@@ -135,12 +168,14 @@ def deformed(sol: Solution, *, scale: float | None = None, colour: Callable | No
         What they are.
     levels : int
         About how many contour levels.
+    engine : {"auto", "pyvista", "matplotlib"}
+        What draws in 3D, as in ``js.plot.solid``.
     ax : Axes, optional
         Where to draw; three-dimensional ones in 3D.
 
     Returns
     -------
-    Axes
+    Axes or pyvista.Plotter
         What it was drawn on.
 
     Raises
@@ -172,13 +207,18 @@ def deformed(sol: Solution, *, scale: float | None = None, colour: Callable | No
     def shade(points: np.ndarray, moved: np.ndarray) -> np.ndarray:
         return np.linalg.norm(moved[:, :dim], axis=1) if colour is None else np.asarray(colour(points), float)
 
-    ax = drawing.axes(ax, dim, drawing.page(np.asarray(sol.cloud.points)))
+    title = f"displacements times {factor:.3g}"
     if dim == 3:
-        facets = boundary_facets(sol.cloud)[0]
-        rest = np.asarray(sol.cloud.points)
-        faces(ax, (rest + factor * numbers[:, :3])[facets], shade(rest, numbers)[facets].mean(axis=1), label)
-        drawing.dress(ax, 3)
-        return ax
+        on, facets, rest = stage(engine, ax), boundary_facets(sol.cloud)[0], np.asarray(sol.cloud.points, float)
+        faces(on, (rest + factor * numbers[:, :3])[facets], shade(rest, numbers)[facets], label)
+        if is_plotter(on):
+            on.add_mesh(surface(rest[facets]), color="grey", opacity=0.15)
+            on.add_text(title, font_size=9, color="black")
+        else:
+            on.set_title(title, fontsize="medium")
+        furnish(on)
+        return on
+    ax = drawing.axes(ax, dim, drawing.page(np.asarray(sol.cloud.points)))
     shown = pieces(sol.cloud, numbers, anywhere)
     shades = [shade(one.places, one.values) for one in shown]
     bounds = drawing.steps(np.concatenate(shades), levels)
@@ -189,11 +229,12 @@ def deformed(sol: Solution, *, scale: float | None = None, colour: Callable | No
         filled = drawing.painted(ax, Piece(at, one.triangles, z, []), bounds, "viridis")
         ax.plot(*_strokes(at[_rim(one.triangles)].transpose(1, 2, 0)), color=_INK, linewidth=0.8)
     ax.figure.colorbar(filled, ax=ax, label=label, shrink=0.85, ticks=drawing.round_ticks())
-    ax.set_title(f"displacements times {factor:.3g}", fontsize="medium")
+    ax.set_title(title, fontsize="medium")
     drawing.dress(ax, 2)
     return ax
 
 
+@explaining
 def principal(sol: Solution, stress: Callable, *, count: int = 20, ax: Any = None) -> Any:
     """Principal stresses in 2D: crosses along their directions, tension in orange and compression in blue.
 

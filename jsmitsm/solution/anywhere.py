@@ -185,6 +185,7 @@ class Anywhere:
         values = values[:, 0] if self._recipe.fields == 1 else values
         return jax.device_put(values) if xp is np else values
 
+    @explaining
     def integral(self, group: str | None = None) -> jax.Array:
         """The integral of u over a boundary group, or without a name over the domain.
 
@@ -218,6 +219,7 @@ class Anywhere:
         points, weights, _ = quadrature(self.cloud, group, self.order)
         return jnp.tensordot(weights, self(points, outside="extrapolate"), axes=1)
 
+    @explaining
     def flux(self, group: str, conductivity: ValueOrFunction = 1.0) -> jax.Array:
         """The integral of conductivity n . grad u over a boundary group, n outward.
 

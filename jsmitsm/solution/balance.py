@@ -8,7 +8,11 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from jsmitsm.discretization.coefficients import Numbers
+from jsmitsm.discretization.layout import Discretization
+from jsmitsm.discretization.least_squares import misfit
 from jsmitsm.runtime.tracers import is_traced
+from jsmitsm.solution.flags import scales
 from jsmitsm.taylor.multi_indices import HIGHEST
 
 # A solvable pure Neumann problem leaves a mean residual below this part of its data,
@@ -16,8 +20,8 @@ COMPATIBLE = 1e-6
 # or one that falls to less than this part of itself from one order to two orders higher.
 KEPT = 0.5
 # In the least-squares form data that do not balance are spread evenly over all fits. A median misfit, added up across
-# the domain, of less than this is what they leave that balance to half a percent; measured, it is 0.024 to 0.034 times
-# the part of them that does not, on any cloud and at any order.
+# the domain, of less than this is what they leave that balance to half a percent; measured over all particles of large
+# clouds, it is 0.024 to 0.034 times the part of them that does not, at any order.
 EVEN = 1e-4
 # Less than the first changes the solution by less than the discretisation does, and slopes taken at corners leave as
 # much. Between the fields of a system both vary more with the order: less than the second is a doubt, not a refusal.
@@ -76,11 +80,27 @@ def with_multiplier(data: Any, r: Any, c: Any, b: Any, ids: np.ndarray) -> tuple
     )  # fmt: skip
 
 
-def spread(misfit: np.ndarray | None, dim: int) -> float:
-    """The median of misfits (N,), in parts of the range, added up across the domain; zero below ``EVEN``."""
-    assert misfit is not None
-    found = float(np.median(misfit)) * len(misfit) ** (1.0 / dim)
-    return found if found > EVEN else 0.0
+def relative_misfit(disc: Discretization, nums: Numbers, values: Any, parts: list[Any] | None = None) -> Any:
+    """By how much the particles' values miss their local fits, in parts of the range; parts: as of ``misfit``."""
+    return misfit(disc, nums, values, parts) / scales(values[:, _leading(disc)]).max()
+
+
+def _leading(disc: Discretization) -> np.ndarray:
+    """The fields that count all derivatives of the equations, (F,) bool."""
+    return np.array(disc.rec.weights) == 0
+
+
+def spread(disc: Discretization, missed: Any) -> Any:
+    """The median of relative misfits, added up across the domain; zero below ``EVEN``.
+
+    Where all that is compared is held, values are met exactly, whatever the data.
+    """
+    free = ~disc.held[:, _leading(disc)].all(axis=1)[disc.active]
+    if not free.any():
+        return 0.0
+    xp = jnp if is_traced(missed) else np
+    found = xp.median(missed[free]) * len(disc.cloud) ** (1.0 / disc.rec.dim)
+    return xp.where(found > EVEN, found, 0.0)
 
 
 def imbalance(turned: Callable[[Any], Any], x: Any, b: Any, n: int) -> Any:

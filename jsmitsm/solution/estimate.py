@@ -13,12 +13,13 @@ import numpy as np
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.discretization.coefficients import Numbers, numbers
 from jsmitsm.discretization.health import LEBESGUE
-from jsmitsm.discretization.layout import Class, Discretization
+from jsmitsm.discretization.layout import Class, Discretization, mean_spacing
 from jsmitsm.discretization.least_squares import misfit
 from jsmitsm.discretization.leave_one_out import matrix, right_side, with_held
 from jsmitsm.discretization.resolution.digits import room
 from jsmitsm.discretization.rows import all_rows
 from jsmitsm.particle.moments import Row
+from jsmitsm.particle.recursion import constraints
 from jsmitsm.runtime.errors import SolveError
 from jsmitsm.runtime.progress import bar
 from jsmitsm.runtime.tracers import concrete, is_traced
@@ -34,6 +35,8 @@ OUTLIER = 2.0
 HIGH, TRUSTED = 6, 0.7
 # Where a lower order sees a smaller error than these, the estimate lies so far between the two, in logarithms.
 DOUBT = 1.0 / 3.0
+# So many particles tell the units of the fields.
+LOOKED_AT = 9
 
 
 @dataclass(frozen=True)
@@ -43,11 +46,13 @@ class Correction:
     error (N, F): the estimated u_exact - u, with its sign.
     made: the defect (N, F), for ``defect``; None for the methods other than S, which have none.
     adjoint: of weights (N, F) of the values in a number, those of the defects in it; None where there are no rows.
+    units (F,): what the fields are multiplied with to be compared with one another.
     """
 
     error: Any
     made: Callable[[], Any] | None
     adjoint: Callable[[np.ndarray], np.ndarray] | None
+    units: Any = 1.0
 
     @cached_property
     def defect(self) -> Any:
@@ -108,7 +113,7 @@ def correction(fit: Fit, values: Any) -> Correction:
     error = spread(x)
     if order > fit.recipe.order >= HIGH and not is_traced(error, trust) and trust.min(initial=1.0) < TRUSTED:
         error = _doubted(fit, low, values, error)
-    return Correction(error, defect, adjoint)
+    return Correction(error, defect, adjoint, comparable(high, high_nums))
 
 
 def _one_scale(mine: Any, theirs: Any, disc: Discretization) -> Any:
@@ -146,23 +151,24 @@ def _trust(disc: Discretization, classes: list[Class], rows: list[Row]) -> Any:
 def _against(fit: Fit, low: Discretization, values: Any) -> Correction:
     """What leads to the solution by method S of order p + 2."""
     order = _beside(fit, low)
-    error = _towards(fit, low, values, order)
+    error, units = _towards(fit, low, values, order)
     if fit.recipe.formulation != "lsq" or is_traced(error):
-        return Correction(error, None, None)
+        return Correction(error, None, None, units)
 
     def missed() -> Any:
         nums = numbers(low, fit.problem, fit.taylor)
-        return _put(np.zeros(low.held.shape), nums.ids, misfit(low, nums, values)[:, None])
+        return _put(np.zeros(low.held.shape), nums.ids, np.asarray(misfit(low, nums, values))[:, None])
 
-    return Correction(error if order < fit.recipe.order else _doubted(fit, low, values, error), missed, None)
+    return Correction(error if order < fit.recipe.order else _doubted(fit, low, values, error), missed, None, units)
 
 
-def _towards(fit: Fit, low: Discretization, values: Any, order: int) -> Any:
-    """What leads from the values to the solution by method S of another order, (N, F)."""
+def _towards(fit: Fit, low: Discretization, values: Any, order: int) -> tuple[Any, Any]:
+    """What leads from the values to the solution by method S of another order, (N, F), and units of the fields."""
     other, nums = _of_order(fit, low, order)
     form = "lsq" if fit.recipe.formulation == "lsq" else "auto"
     run = Run(other, fit.problem, "auto", True, form == "auto", form)
-    return with_held(other, nums, run.solved(*run.assembled(nums), balanced=False)[0]) - values
+    found = with_held(other, nums, run.solved(*run.assembled(nums), balanced=False)[0])
+    return found - values, comparable(other, nums)
 
 
 def _doubted(fit: Fit, low: Discretization, values: Any, error: Any) -> Any:
@@ -176,11 +182,25 @@ def _doubted(fit: Fit, low: Discretization, values: Any, error: Any) -> Any:
     if order == fit.recipe.order:
         return error
     try:
-        other = _towards(fit, low, values, order)
+        other, _ = _towards(fit, low, values, order)
     except SolveError:
         return error
     far, near = (share(np.asarray(e), np.asarray(values)) for e in (error, other))
     return other * (far / near) ** DOUBT if 0.0 < near < far else error
+
+
+def comparable(disc: Discretization, nums: Numbers) -> Any:
+    """What fields of unlike units, a velocity and a pressure, are multiplied with to be compared, (F,).
+
+    As they are in the local fits, at the mean spacing; the median of some particles.
+    """
+    rec = disc.rec
+    if not any(rec.weights) or is_traced(nums.jac, disc.cloud.points):
+        return 1.0
+    jac, length = np.asarray(nums.jac)[:, :, :1], mean_spacing(disc)
+    some = np.linspace(0, jac.shape[-1] - 1, min(jac.shape[-1], LOOKED_AT)).astype(int)
+    units = np.median([constraints(rec, jac[..., k], length, np)[2] for k in some], axis=0)
+    return length ** np.array(rec.weights, float) / units
 
 
 def lower(order: int, least: int) -> int:

@@ -13,6 +13,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm.discretization.health import LEBESGUE
@@ -22,6 +23,7 @@ from jsmitsm.discretization.resolution.contradictions import contradictions
 from jsmitsm.discretization.resolution.steepness import steepness, unseen
 from jsmitsm.discretization.rows import all_rows
 from jsmitsm.runtime.errors import some
+from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.solution.between import between
 
 # A particle may differ from the linear function through its neighbours by this part of the
@@ -135,11 +137,12 @@ def share(error: np.ndarray, values: np.ndarray, nothing: float = NOTHING) -> fl
     return float(np.max(np.linalg.norm(error / size, axis=0) / np.where(scale > 0, scale, 1.0)))
 
 
-def scales(values: np.ndarray) -> np.ndarray:
+def scales(values: Any) -> Any:
     """The range of each field (F,), not below the round-off of the values: a constant has no range of its own."""
-    size = np.abs(values).max(axis=0, initial=0.0)
-    scale = np.maximum(np.ptp(values, axis=0), np.maximum(FLAT * size, NOTHING * size.max(initial=0.0)))
-    return np.where(scale > 0, scale, 1.0)
+    xp = jnp if is_traced(values) else np
+    size = xp.abs(values).max(axis=0, initial=0.0)
+    scale = xp.maximum(xp.ptp(values, axis=0), xp.maximum(FLAT * size, NOTHING * size.max(initial=0.0)))
+    return xp.where(scale > 0, scale, 1.0)
 
 
 def _roughness(run: Any, values: np.ndarray, nums: Any, out: list[str], found: dict[str, float]) -> None:

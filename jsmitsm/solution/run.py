@@ -15,7 +15,7 @@ from jsmitsm.discretization import health
 from jsmitsm.discretization.coefficients import Numbers, numbers
 from jsmitsm.discretization.held_particles import with_held_expansions
 from jsmitsm.discretization.layout import Class, Discretization, discretize
-from jsmitsm.discretization.least_squares import least_squares, misfit
+from jsmitsm.discretization.least_squares import least_squares
 from jsmitsm.discretization.leave_one_out import matrix, right_side, with_held
 from jsmitsm.discretization.operator_kind import prefers_least_squares, usual_condition
 from jsmitsm.discretization.rows import all_coefficients, all_rows
@@ -24,14 +24,16 @@ from jsmitsm.linear import linsolve
 from jsmitsm.particle.moments import Row
 from jsmitsm.runtime.errors import SolveError, some
 from jsmitsm.runtime.tracers import concrete, is_traced
-from jsmitsm.solution.balance import imbalance, spread, unbalanced, with_multiplier
-from jsmitsm.solution.flags import flags, scales
+from jsmitsm.solution.balance import imbalance, relative_misfit, spread, unbalanced, with_multiplier
+from jsmitsm.solution.flags import flags
 from jsmitsm.solution.memory import refuse_too_large
 from jsmitsm.solution.statistics import of_run
 
 # Under a JAX transform a system is taken for singular whose solution outgrows its right-hand side by so many times the
 # usual condition, and data for unbalanced that leave this part of them: there no other order is compared.
 GROWN, BALANCED = 1e4, 1e-2
+# ... or, in the least-squares form, leave so much of the range in all fits, see ``jsmitsm.solution.balance.EVEN``.
+SPREAD = 1e-3
 # What an equation and a condition say of one particle may differ by this part of the solution.
 CONTRADICTION = 1e-6
 
@@ -150,7 +152,9 @@ class Run:
 
         altered: a function of the system's entries, their rows and columns and the right-hand side that returns others.
         """
-        data, r, c, b = self.assembled(nums)
+        # What the least-squares form leaves of data that may not balance is looked at below.
+        parts: list[Any] | None = [] if self.floating and self.disc.linear and is_traced(vars(nums)) else None
+        data, r, c, b = self.assembled(nums, parts)
         if altered is not None:
             data, r, c, b = altered(data, r, c, b)
         start = time.perf_counter()
@@ -160,6 +164,8 @@ class Run:
         if is_traced(values):
             known = concrete(values)
             finite = jnp.isfinite(values) if known is None else np.isfinite(np.asarray(known))
+            if parts:
+                good &= spread(self.disc, relative_misfit(self.disc, nums, values, parts)) <= SPREAD
             return values, finite.all() & good
         self.keep(nums, values)
         self._check_degenerate(nums, values)
@@ -329,7 +335,7 @@ class Run:
         """
         if self.formulation != "lsq":
             return self.imbalance
-        return spread(self.misfit, self.disc.rec.dim) if self.disc.linear else 0.0
+        return float(spread(self.disc, self.misfit)) if self.disc.linear else 0.0
 
     def _imbalance_at(self, taylor: Any, order: int) -> float:
         """The same of the same problem with method S of another order."""
@@ -366,8 +372,7 @@ class Run:
         """By how much each particle's value misses its local fit, in parts of the range; of the least-squares form."""
         if self.formulation != "lsq" or self.nums is None or self.values is None:
             return None
-        leading = np.array(self.disc.rec.weights) == 0
-        return misfit(self.disc, self.nums, self.values) / scales(self.values[:, leading]).max()
+        return relative_misfit(self.disc, self.nums, self.values)
 
     def condition_numbers(self) -> tuple[np.ndarray, float]:
         """Of the particles' moment matrices (N,), and of the global system."""

@@ -35,7 +35,6 @@ class Report(Protocol):
 class Solution(Anywhere):
     """A solution at the particles, and anywhere through local Taylor polynomials.
 
-
     ``sol(points)`` evaluates it at points (M, D), ``sol.grad(points)`` its gradient.
 
     A solution is a pytree: it passes through ``jax.jit``, ``jax.grad`` and ``pickle``.
@@ -152,14 +151,16 @@ class Solution(Anywhere):
 
     def _size(self, found: Correction) -> Array:
         """The size of an estimated error, kept for the next who asks."""
-        return self._kept(abs(found.error)[..., 0] if self._recipe.fields == 1 else abs(found.error))
+        error = abs(found.error)[..., 0] if self._recipe.fields == 1 else abs(found.error)
+        return self._kept(error, found.units)
 
-    def _kept(self, error: Array) -> Array:
+    def _kept(self, error: Array, units: Any = 1.0) -> Array:
         if not is_traced(error, self._values):
             self._error = frozen(error)
             # The least-squares form has the squares of the systems: what is left of a field that is zero is larger.
             nothing = SQUARED if self._recipe.formulation == "lsq" else NOTHING
-            self._share = share(np.reshape(error, np.shape(self._values)), np.asarray(self._values), nothing)
+            error_of = np.reshape(error, np.shape(self._values))
+            self._share = share(error_of * units, np.asarray(self._values) * units, nothing)
         return error
 
     @property
@@ -172,6 +173,7 @@ class Solution(Anywhere):
         """Whether the estimate knows defects, and ``correction`` more than the size of the error."""
         return not hasattr(self._fit, "error_estimate")
 
+    @explaining
     def correction(self) -> Correction:
         """What the error estimate is made of, for those who refine by it.
 
@@ -227,6 +229,7 @@ class Solution(Anywhere):
         found = [*(self._found or []), *self.stats.get("objections", []), *([] if self._share <= LARGE else [large])]
         return explained(found)
 
+    @explaining
     def condition_numbers(self) -> tuple[np.ndarray, float]:
         """Condition numbers of every particle's moment matrix and of the global system.
 

@@ -11,8 +11,7 @@ from jsmitsm.cloud.regions.region_cloud import RegionCloud
 from jsmitsm.discretization.coefficients import numbers
 from jsmitsm.discretization.layout import discretize, table
 from jsmitsm.equation.problem import Problem
-from jsmitsm.equation.regions.per_region import PerRegion
-from jsmitsm.equation.unknowns.regular import regular_problem
+from jsmitsm.equation.unknowns.regular import regular_in_regions, regular_problem
 from jsmitsm.equation.unknowns.stated import stated
 from jsmitsm.equation.unknowns.two_fields import two_fields, two_parts
 from jsmitsm.linear.linsolve import Solver
@@ -25,13 +24,19 @@ from jsmitsm.solution.arguments import Depth, Formulation, Method, check, of_reg
 from jsmitsm.solution.fit import Fit, Recipe
 from jsmitsm.solution.nonlinear.newton import newton
 from jsmitsm.solution.order_choice import check_tolerance, of_tolerance
-from jsmitsm.solution.regions.solve import solve_regions
+from jsmitsm.solution.regions.solve import prepared_regions, regions_recipe, solve_regions
 from jsmitsm.solution.run import Run
 from jsmitsm.solution.solution import Solution
-from jsmitsm.solution.unknowns.bordered import BorderedRun
+from jsmitsm.solution.unknowns.bordered import BorderedRegionsRun, BorderedRun
 from jsmitsm.solution.unknowns.complex_solution import complex_solution
 from jsmitsm.solution.unknowns.constrained import solve_constrained
-from jsmitsm.solution.unknowns.point_solution import PointSolution, check_inside
+from jsmitsm.solution.unknowns.integral import IntegralTerm
+from jsmitsm.solution.unknowns.point_solution import (
+    PointSolution,
+    RegionsPointSolution,
+    check_inside,
+    regions_of_sources,
+)
 
 
 @explaining
@@ -144,12 +149,12 @@ def solve(
 def prepared(
     problem: Problem, cloud: Cloud, *, method: str = "S", order: int = 4, kernel: Kernel | None = None,
     stencils: Stencils | None = None, basis_terms: int | None = None, formulation: str = "auto", solver: str = "auto",
-    u0: Any = None, throw: bool = True, depth: Depth = "auto", kind: type[Run] = Run,
+    u0: Any = None, throw: bool = True, depth: Depth = "auto", kind: type[Run] = Run, sources: bool = False,
 ) -> Run:  # fmt: skip
-    """Checked arguments of ``js.solve``, discretised; kind: of run that is made of them."""
+    """Checked arguments of ``js.solve``, discretised; kind: of run that is made of them, sources: see discretize."""
     start = time.perf_counter()
     check(problem, cloud, method, order, kernel, stencils, formulation, solver, u0, throw, depth)
-    disc = discretize(problem, cloud, method, order, kernel, stencils, basis_terms, sources=False, depth=depth)
+    disc = discretize(problem, cloud, method, order, kernel, stencils, basis_terms, sources=sources, depth=depth)
     problem = disc.problem
     run = kind(disc, problem, solver, throw, kernel is None and stencils is None, formulation)
     run.began, run.seconds["set-up"] = start, time.perf_counter() - start
@@ -178,27 +183,33 @@ def recipe_of(run: Run) -> Recipe:
 def with_extras(problem: Problem, cloud: Cloud, *, order: Any, **options: Any) -> Solution:
     """The solution of a problem with constraints, complex values or point sources; options as those of ``js.solve``."""
     assert problem.extras is not None
-    several = isinstance(cloud, RegionCloud) or isinstance(problem.pde, PerRegion)
-    if several and not problem.extras.complex_values:
-        raise ValueError(
-            "problem: constraints, unknowns and sources are not made for several regions; use one region, and in place "
-            "of a point source a Gaussian in the pde, strength exp(-|x - x0|^2 / (2 w^2)) / (2 pi w^2)^(D/2) with w "
-            "about three spacings"
-        )
+    several = of_regions(problem, cloud)
     if problem.extras.complex_values:
         if options["method"] not in ("S", "SSPH"):
             raise ValueError(f'method: {options["method"]} treats one real field; use "S" for dtype=complex')
         options["u0"] = two_parts(options["u0"], problem.fields)
         return complex_solution(solve(two_fields(problem), cloud, order=order, **options))
     if problem.extras.sources:
+        if several:
+            assert isinstance(cloud, RegionCloud)
+            where = regions_of_sources(problem.extras.sources, cloud)
+            made, parts = regular_in_regions(problem, cloud, where)
+            return RegionsPointSolution.of(solve(made, cloud, order=order, **options), parts)  # type: ignore[arg-type]
+        check_inside(problem.extras.sources, cloud)
         regular, singular = regular_problem(problem, cloud)
-        check_inside(singular, cloud)
         return PointSolution.of(solve(regular, cloud, order=order, **options), singular)
-    run = prepared(stated(problem, problem.extras.unknowns), cloud, order=order, kind=BorderedRun, **options)
-    assert isinstance(run, BorderedRun)
+    term = IntegralTerm(problem, cloud) if problem.extras.kernels else None
+    plain = stated(problem, problem.extras.unknowns)
+    run: Any
+    if several:
+        run = prepared_regions(plain, cloud, order=order, kind=BorderedRegionsRun, sources=term is not None, **options)
+    else:
+        run = prepared(plain, cloud, order=order, kind=BorderedRun, sources=term is not None, **options)
+    if term is not None:
+        run.term, run.whole = term, stated(problem, problem.extras.unknowns, term.points)
 
     def again(order: int) -> Any:
         other = {"method": "S", "depth": run.disc.rec.depth, "solver": options["solver"]}
         return solve(problem, cloud, order=order, **other)._values
 
-    return solve_constrained(problem, run, recipe_of(run), again)
+    return solve_constrained(problem, run, regions_recipe(run) if several else recipe_of(run), again)

@@ -45,10 +45,10 @@ def multi_indices(dim: int, degree: int) -> tuple[MultiIndex, ...]:
     >>> multi_indices(2, 2)
     ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
     """
-    if isinstance(degree, bool) or int(degree) != degree:
-        raise ValueError(f"degree: expected a whole number, got {degree!r}")
-    if dim < 1:
-        raise ValueError(f"dim must be at least 1, got {dim!r}")
+    if isinstance(degree, bool) or not isinstance(degree, (int, float, np.integer)) or int(degree) != degree:
+        raise ValueError(f"degree: expected a whole number, got {degree!r} (docs: choosing)")
+    if not isinstance(dim, (int, float, np.integer)) or dim < 1:
+        raise ValueError(f"dim must be at least 1, got {dim!r} (docs: choosing)")
     return tuple(a for d in range(degree + 1) for a in _of_degree(dim, d))
 
 

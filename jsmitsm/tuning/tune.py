@@ -18,6 +18,7 @@ from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.discretization.supports import default_kernel
 from jsmitsm.equation.problem import Problem
 from jsmitsm.particle.kernels import Kernel
+from jsmitsm.runtime import notebooks
 from jsmitsm.runtime.arrays import ArrayLike, ValueOrFunction
 from jsmitsm.runtime.errors import did_you_mean, explaining, is_whole
 from jsmitsm.runtime.progress import bar
@@ -81,6 +82,13 @@ class TuneResult:
         seen = self.history["objective"]
         best = np.nanmin(seen) if len(seen) else np.nan
         return f"TuneResult({self.kernel!r}, objective {seen[0]:.3g} -> {best:.3g}, {self.solves} solves)"
+
+    def _repr_html_(self) -> str:
+        seen = np.asarray(self.history["objective"], float)
+        rows: list[tuple[str, Any]] = [("kernel", repr(self.kernel)), ("steps, solves", f"{len(seen)}, {self.solves}")]
+        rows += [("objective", f"{seen[0]:.3g} to {np.nanmin(seen):.3g}")] if len(seen) else []
+        rows += [("messages", " ".join(self.messages) or "none")]
+        return notebooks.shown("TuneResult", rows) + self.solution._repr_html_()
 
 
 @explaining

@@ -182,3 +182,32 @@ def test_a_mesh_with_tagged_cells_is_a_cloud_of_regions():
     assert list(js.files.from_mesh(mesh, regions=["wool", "steel", "air"]).interfaces)[0] == "wool|steel"
     with pytest.raises(ValueError, match="quad cell|'quad' cell 0 belongs to no region"):
         js.files.from_mesh(mesh, regions=["air", "wool"])
+
+
+def test_a_lattice_is_cut_by_predicates():
+    """Cells belong to whom their middle satisfies: copies and normals along the sides of cells, an L for a domain."""
+    halves = {"a": lambda x: x[:, 0] < 0.5, "b": lambda x: (x[:, 0] > 0.5) & (x[:, 1] < 0.5)}
+    sides = {"left": lambda x: x[:, 0] < 1e-9, "rest": lambda x: x[:, 0] > -1.0}
+    cloud = js.regions(halves, ((0, 0), (1, 1)), lattice=(9, 9), groups=sides)
+    assert [len(ids) for ids in cloud.regions.values()] == [45, 25] and len(cloud.groups["left"]) == 9
+    assert len(cloud.interfaces["a|b"]) == 5 and np.array_equal(cloud.interface_normals["a|b"], [[1.0, 0.0]] * 5)
+    corner = next(i for i in cloud.groups["rest"] if np.array_equal(cloud.points[i], [1.0, 0.5]))
+    assert np.allclose(cloud.normals[corner], [0.5**0.5, 0.5**0.5]) and cloud.spacing == 0.125
+    inside = lambda x: (np.abs(x) < 0.3).all(axis=1)  # noqa: E731
+    space = js.regions({"in": inside, "out": lambda x: ~inside(x)}, ((-1,) * 3, (1,) * 3), lattice=(11,) * 3)
+    assert len(space.regions["in"]) == 64 and len(space.interfaces["in|out"]) == 56
+    disk = js.sdf.circle((0.0, 0.0), 0.5)
+    rings = js.regions({"in": disk, "out": lambda x: np.hypot(*x.T) > 0.5}, ((-1, -1), (1, 1)), lattice=(9, 9))
+    assert len(rings.interfaces["in|out"]) == 16  # around twelve cells
+    box = {"bounds": ((0, 0), (1, 1)), "lattice": (9, 9)}
+    checks = lambda x: (x[:, 0] < 0.5) == (x[:, 1] < 0.5)  # noqa: E731
+    for shapes, more, told in [
+        ({**halves, "c": lambda x: x[:, 1] > 0.4}, {}, "'a' and 'c' overlap"),
+        ({**halves, "c": lambda x: x[:, 1] > 4}, {}, "holds the middle of no cell"),
+        ({"a": checks, "b": lambda x: ~checks(x)}, {}, "touch in a point alone"),
+        ({"a": [(0, 0), (1, 0), (1, 1)]}, {}, "expected a predicate"),
+        (halves, {"lattice": 9}, "expected 2 whole numbers from 3"),
+        (halves, {"spacing": 0.1}, "no spacing"),
+    ]:
+        with pytest.raises(ValueError, match=told):
+            js.regions(shapes, **{**box, **more})

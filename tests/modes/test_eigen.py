@@ -105,6 +105,40 @@ def test_beams_of_fourth_order():
     assert np.allclose(values**0.25, [4.730040744862704, 7.853204624095838], rtol=1e-5)
 
 
+def test_a_plate_buckles():
+    """52.34469 and a double value, of which only the sum of both parts counts; the mass is an operator."""
+    biharmonic = lambda u, x: js.laplacian(js.laplacian(u))(x)  # noqa: E731
+    problem = js.Problem(biharmonic, dict.fromkeys(SIDES, CLAMPED))
+    modes = js.eigen(problem, js.rectangle((0, 0), (1, 1), (11, 11)), 2, order=4, mass=minus_laplacian)
+    error = np.abs(modes.values / [52.34469, 92.12444, 92.12444] - 1)
+    assert modes.values.dtype == float and modes.flags == [] and (error < [0.01, 0.03, 0.03]).all()
+    assert (0.3 * error < modes.error_estimate() / modes.values).all()
+    assert "Modes 1 to 2 are of one value" in modes.diagnose() and modes.residuals.max() < 1e-10
+    assert modes(0, [[0.5, 0.5]])[0] > 0.9 * np.abs(modes.u[:, 0]).max()
+
+
+def test_gradients_through_an_operator_as_the_mass():
+    column = js.Problem(
+        lambda u, x, a: (1 + a * x[0]) * js.partial(u, (4,))(x), {"left": CLAMPED, "right": CLAMPED}, params=0.3
+    )
+    rod = js.interval(0.0, 1.0, 21)
+
+    def load(a):
+        mass = lambda u, x, a: -(1 + a * x[0] ** 2) * js.laplacian(u)(x)  # noqa: E731
+        return js.eigen(column.replace(params=a), rod, 1, order=4, mass=mass).values[0]
+
+    slope = difference(load, 0.3)
+    assert abs(jax.grad(load)(0.3) - slope) < 1e-6 * abs(slope)
+
+
+def test_double_values_of_a_ring_are_real():
+    """The parts of a double value stand apart by as much as its error, one above the other here."""
+    ring = js.Problem(minus_laplacian, {"left": js.periodic("left", "right")})
+    modes = js.eigen(ring, js.interval(0.0, 1.0, 31), 4)
+    assert modes.values.dtype == float and modes.flags == []
+    assert np.allclose(modes.values, 4 * PI2 * np.array([0, 1, 1, 4, 4]), atol=1e-9, rtol=1e-4)
+
+
 def test_an_elastic_square_between_rollers(lattice):
     """Pressure waves (lambda + 2 mu) k^2 and shear waves mu k^2, k^2 = pi^2 (m^2 + n^2), of a square of density 2."""
     nu = 0.3
@@ -243,6 +277,9 @@ def test_pickled_and_through_jit(modes, disk):
         ({"mass": 0.0}, "mass: zero in every equation"),
         ({"mass": lambda x: jnp.nan * x[0]}, "mass: NaN or infinite at particle 0"),
         ({"mass": lambda x: x}, "mass: expected a scalar"),
+        ({"mass": lambda u, x: js.laplacian(u)(x)}, "mass: an operator of order 2, but the pde is of order 2"),
+        ({"mass": lambda u, x: js.grad(u)(x)}, r"mass: the operator returns 2 value\(s\)"),
+        ({"mass": lambda u, x: u(x) ** 2}, "mass: an operator is linear in u"),
         ({"depth": -1}, "depth: expected"),
         ({"order": 1}, "order: 1 is below the order 2"),
     ],

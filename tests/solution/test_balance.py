@@ -85,3 +85,28 @@ def test_a_nonlinear_field_floats_too():
     assert sol.converged and np.abs(sol.u - values + values.mean()).max() < 1e-4
     with pytest.raises(js.SolveError, match="do not balance"):
         js.solve(bent(0.05), line)
+
+
+def test_a_flow_that_does_not_balance_is_seen_under_jit():
+    """Poiseuille's, of which a fifth more flows out; a tenth of what must balance is seen, see ``run.SPREAD``."""
+    cloud = js.rectangle((0, 0), (1, 1), (6, 6), jitter=0.2)
+
+    def pde(u, x, q):
+        force = js.grad(u[2])(x) - js.laplacian(u[:2])(x)
+        return jnp.append(force, js.divergence(u[:2])(x))
+
+    wall = [js.dirichlet(lambda x, q: x[1] * (1 - x[1]), field=0), js.dirichlet(0.0, field=1)]
+    out = [js.dirichlet(lambda x, q: (1 + q) * x[1] * (1 - x[1]), field=0), wall[1]]
+    bcs = dict.fromkeys(("left", "bottom", "top"), wall) | {"right": out}
+    near = js.stencils(cloud, size=14)
+
+    @jax.jit
+    def solved(excess):
+        problem = js.Problem(pde, bcs, fields=3, params=excess)
+        sol = js.solve(problem, cloud, order=2, depth=0, stencils=near, throw=False)
+        return sol.u, sol.converged
+
+    u, converged = solved(0.0)
+    y = cloud.points[:, 1]
+    np.testing.assert_allclose(u[:, 0], y * (1 - y), atol=1e-9)
+    assert converged and not solved(0.2)[1]

@@ -301,3 +301,86 @@ def test_pictures_and_files_keep_the_jump(tmp_path):
     assert isinstance(mesh, meshio.Mesh) and mesh.cell_data["region"][0].tolist() == [0, 0, 1, 1]
     js.files.to_csv(sol, tmp_path / "u.csv")
     assert "region" in (tmp_path / "u.csv").read_text().splitlines()[0]
+
+
+# ------------------------------------------------------------------ what is found with u
+
+
+def test_constraints_and_unknowns_speak_of_regions_and_interfaces():
+    """k u'' = -q on two layers held at zero, a contact of resistance 1/5 between: quadratics whose q is one number."""
+    k, cloud = {"a": 1.0, "b": 3.0}, js.regions({"a": (0.0, 0.5), "b": (0.5, 1.0)}, spacing=0.125)
+    flux = {n: lambda u, x, n_, g, c=c: c * n_ @ js.grad(u)(x) for n, c in k.items()}
+    pde = {n: lambda u, x, g, c=c: c * js.laplacian(u)(x) + g["q"] for n, c in k.items()}
+    bcs = {"boundary": js.dirichlet(0.0), "a|b": js.interface(flux, resistance=lambda x, g: 0.2)}
+
+    def solved(functional, value):
+        given = [js.constraint(functional, value)]
+        return js.solve(js.Problem(pde, bcs, unknowns={"q": 1.0}, constraints=given), cloud)
+
+    # u_a = s x - q x^2 / 2 and u_b = t (1 - x) - q (1 - x)^2 / 6 of one flux p = s - q / 2 in the middle.
+    p = 1.0 * (1 / 8 * (1 / 3 - 1)) / (1 / 2 + 1 / 6 + 1 / 5)  # of q = 1
+    slope = p + 0.5
+    inside = slope / 8 - 1 / 48
+    cases = [(lambda s: s.integral(region="a"), inside), (lambda s: s.flux("a|b", 1.0, region="a"), p),
+             (lambda s: s([[0.25]])[0], slope / 4 - 1 / 32)]  # fmt: skip
+    for functional, one in cases:
+        sol = solved(functional, 3.0 * one)
+        assert abs(sol.unknowns["q"] - 3.0) < 1e-10 and sol.flags == []
+        assert abs(sol.region("a")([[0.25]])[0] - 3.0 * (slope / 4 - 1 / 32)) < 1e-11
+    assert abs(jax.grad(lambda v: solved(cases[0][0], v).unknowns["q"])(1.0) - 1.0 / inside) < 1e-9 / inside
+    assert sol.error_estimate().max() < 1e-11 and pickle.loads(pickle.dumps(sol)).unknowns == sol.unknowns
+    wrong = js.Problem({n: lambda u, x, g: g["q"] * js.laplacian(u)(x) + 1.0 for n in k}, bcs, unknowns={"q": 1.0},
+                       constraints=[js.constraint(cases[0][0], 1.0)])  # fmt: skip
+    with pytest.raises(ValueError, match="multiplies u"):
+        js.solve(wrong, cloud)
+    ends = {"boundary": js.neumann(lambda x: 2.0 * x[0] - 1.0), "a|b": js.interface(conduction(k), source=-3.0)}
+    free = js.Problem(dict.fromkeys(k, laplace), ends, constraints=[js.constraint(lambda s: s.integral(), 2.0)])
+    with pytest.raises(js.SolveError, match="do not balance"):  # the flux that leaves is none of what comes
+        js.solve(free, cloud)
+
+
+def test_a_point_source_in_one_of_two_media():
+    """k laplacian(u) = s delta: with its image in the other half-plane, log r is the solution."""
+    k, s = {"a": 2.0, "b": 5.0}, 3.0
+    half = {"a": [(0, 0), (1, 0), (1, 1), (0, 1)], "b": [(1, 0), (2, 0), (2, 1), (1, 1)]}
+    sides = {"left": lambda x: x[:, 0] < 1e-9, "rest": lambda x: x[:, 0] > -1}
+    cloud, place = js.regions(half, spacing=0.125, groups=sides), np.array([0.47, 0.53])
+    log = lambda x, p: 0.5 * jnp.log((x - p) @ (x - p)) / (2 * jnp.pi)  # noqa: E731
+    mirrored = (k["a"] - k["b"]) / (k["a"] + k["b"])
+    exact = {
+        "a": lambda x: s / k["a"] * (log(x, place) + mirrored * log(x, np.array([1.53, 0.53]))),
+        "b": lambda x: 2 * s / (k["a"] + k["b"]) * log(x, place),
+    }
+    truth = values(cloud, exact)
+    given = js.dirichlet(truth[cloud.groups["rest"]])
+    slope = js.condition(lambda u, x, n: n @ (js.grad(u)(x) - jax.grad(exact["a"])(x)))
+    pde = {n: lambda u, x, c=c: c * js.laplacian(u)(x) for n, c in k.items()}
+    flux = conduction(k)
+    contact = lambda a, b, x, n: jnp.array([a(x) - b(x), flux["a"](a, x, n) - flux["b"](b, x, n)])  # noqa: E731
+    for between in (js.interface(flux), js.interface(residual=contact)):
+        problem = js.Problem(pde, {"left": slope, "rest": given, "a|b": between},
+                             sources=[js.point_source(place, s)])  # fmt: skip
+        sol = js.solve(problem, cloud)
+        # Four spacings from the source to the interface; 1e-4 was measured.
+        assert np.abs(sol.u - truth).max() < 3e-4 and sol.flags == []
+    points = np.array([[0.3, 0.5], [1.7, 0.2]])
+    assert np.abs(sol(points) - np.array([exact["a"](points[0]), exact["b"](points[1])])).max() < 3e-4
+    across = sol.flux("a|b", k["a"], region="a"), sol.flux("a|b", k["b"], region="b")
+    assert abs(across[0] - across[1]) < 3e-3
+    with pytest.raises(ValueError, match="quadrature over the domain is not made for the singularity"):
+        sol.integral()
+    both = {"left": slope, "rest": js.condition(lambda u, x, n: u(x)), "a|b": js.interface(flux)}
+    with pytest.raises(ValueError, match="give each region a group of its own"):
+        js.solve(js.Problem(pde, both, sources=[js.point_source(place, s)]), cloud)
+    with pytest.raises(ValueError, match="outside of the domain"):
+        js.solve(js.Problem(pde, both, sources=[js.point_source([0.5, 7.0], s)]), cloud)
+
+
+def test_a_linear_solution_is_not_singular_at_the_corners_of_an_interface():
+    """A square in a square of the same material, u = x: rings around its corners see it from unlike directions."""
+    inner, box = js.sdf.rectangle((0.6, 0.6), (0.9, 0.9)), ((0.0, 0.0), (1.0, 1.0))
+    around = js.sdf.difference(js.sdf.rectangle(*box), inner)
+    cloud = js.regions({"in": inner, "out": around}, box, 0.05)
+    bcs = {"boundary": js.dirichlet(lambda x: x[0]), "in|out": js.interface(conduction({"in": 1.0, "out": 1.0}))}
+    sol = js.solve(js.Problem({"in": laplace, "out": laplace}, bcs), cloud, order=2)
+    assert np.abs(sol.u - cloud.points[:, 0]).max() < 1e-12 and sol.flags == []

@@ -9,7 +9,7 @@ import pytest
 from scipy.special import k0, y0
 
 import jsmitsm as js
-from jsmitsm.equation.unknowns.point_source import Singular
+from jsmitsm.equation.unknowns.point_source import Kelvin, Singular
 
 DISK = js.from_sdf(js.sdf.circle((0.0, 0.0), 1.0), ((-1.0, -1.0), (1.0, 1.0)), 0.15)
 Y = np.array([0.31, -0.22])
@@ -137,3 +137,49 @@ def test_what_is_refused():
     for ask in (sol.integral, lambda: sol.coefficients, lambda: js.factorize(problem, DISK)):
         with pytest.raises(ValueError, match="point source"):
             ask()
+
+
+def test_kelvins_solution_in_plane_elasticity():
+    """Tractions on one side and displacements on the others are those of a force and a polynomial: exact."""
+    mu, lam, place, force = 1.3, 2.1, np.array([0.43, 0.37]), np.array([1.0, -0.5])
+    part = Kelvin(place[None], force[None], mu, lam + mu)
+
+    def stress(gradient):
+        strain = (gradient + gradient.T) / 2
+        return 2 * mu * strain + lam * jnp.trace(strain) * jnp.eye(2)
+
+    exact = lambda x: part.at(x) + jnp.array([x[0] * x[1], x[0] ** 2 - x[1]])
+    pde = lambda u, x: js.divergence(lambda y: stress(js.grad(u)(y)))(x) - jnp.array([0.0, 2 * mu + (lam + mu)])
+    traction = js.condition(lambda u, x, n: (stress(js.grad(u)(x)) - stress(jax.jacfwd(exact)(x))) @ n)
+    slope = lambda x: -jax.jacfwd(exact)(x)[1, 0]
+    bcs = {"left": [js.dirichlet(lambda x: exact(x)[0], field=0), js.neumann(slope, field=1)], "right": traction,
+           "top": js.dirichlet(exact), "bottom": js.dirichlet(exact)}  # fmt: skip
+    problem = js.Problem(pde, bcs, fields=2, sources=[js.point_source(place, force)])
+    sol = js.solve(problem, SQUARE)
+    assert abs(sol.u - jax.vmap(exact)(SQUARE.points)).max() < 1e-11 and not sol.flags
+    other = lambda u, x: pde(u, x) + u(x)
+    with pytest.raises(ValueError, match="other terms than those of elasticity"):
+        js.solve(js.Problem(other, bcs, fields=2, sources=[js.point_source(place, force)]), SQUARE)
+    with pytest.raises(ValueError, match=r"strength of shape \(\), but \(2,\) is expected"):
+        js.solve(js.Problem(pde, bcs, fields=2, sources=[js.point_source(place, 1.0)]), SQUARE)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_kelvins_solution_balances_its_force(dim, a=1.3, b=3.4):
+    """No residual away from the force, and tractions around it that sum to it."""
+    force = np.array([1.0, -0.5, 0.3])[:dim]
+    part = Kelvin(np.zeros((1, dim)), force[None], a, b)
+    bent = jax.jit(jax.jacfwd(jax.jacfwd(part.at)))(jnp.array([0.7, -0.4, 0.5])[:dim])
+    assert abs(a * jnp.einsum("ijj->i", bent) + b * jnp.einsum("jji->i", bent)).max() < 1e-12
+    # a grad u + b div(u) I has the same divergence; on the sphere the design of the axes is exact for what is odd.
+    angle = 2 * np.pi * np.arange(12) / 12
+    if dim == 2:
+        normals, weights = np.stack([np.cos(angle), np.sin(angle)], 1), np.full(12, 2 * np.pi / 12)
+    else:
+        z, w = np.polynomial.legendre.leggauss(6)
+        ring = np.sqrt(1 - z**2)[:, None]
+        normals = np.stack([ring * np.cos(angle), ring * np.sin(angle), z[:, None] + 0 * angle], -1).reshape(-1, 3)
+        weights = np.repeat(w, 12) * 2 * np.pi / 12
+    slope = jax.vmap(jax.jacfwd(part.at))(normals)
+    pull = a * jnp.einsum("nij,nj->ni", slope, normals) + b * jnp.trace(slope, axis1=1, axis2=2)[:, None] * normals
+    assert abs(weights @ pull - force).max() < 1e-12

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -12,6 +12,8 @@ from jsmitsm.cloud import filling, levelset
 from jsmitsm.cloud.cloud import INTERIOR
 from jsmitsm.cloud.filling import SpacingLike
 from jsmitsm.cloud.packing.octree import Spacing
+from jsmitsm.cloud.regions.lattice import cut_lattice
+from jsmitsm.cloud.regions.probes import directions, share_a_side
 from jsmitsm.cloud.regions.region_cloud import RegionCloud
 from jsmitsm.cloud.regions.shapes import Interval, Shape, shape_of
 from jsmitsm.cloud.shapes import Predicate, checked_bounds, checked_seed, grouped, own_normals
@@ -22,7 +24,7 @@ from jsmitsm.runtime.progress import bar
 # A particle is on the boundary of a shape if it is nearer to it than this part of the whole domain.
 _ON = 1e-9
 # Probes around a particle, at this part of the spacing, tell which regions meet there.
-_PROBE, _PROBES = 0.02, 24
+_PROBE = 0.02
 # Boundaries nearer to one another than this part of the spacing, or crossing by it, were meant to be one.
 _GAP, _OVERLAP = 0.4, 0.02
 
@@ -36,6 +38,7 @@ def regions(
     *,
     seed: int = 0,
     groups: Mapping[str, Predicate] | None = None,
+    lattice: Sequence[int] | None = None,
 ) -> RegionCloud:
     """Particles of a domain made of several regions, with a copy for each side wherever two of them meet.
 
@@ -54,6 +57,10 @@ def regions(
     groups : mapping, optional
         Maps names of groups of the outer boundary to predicates as for ``js.from_sdf``; without it the
         outer boundary is the group ``"boundary"``.
+    lattice : sequence of int (D,), optional
+        In place of ``spacing``: the particles of a lattice on the box ``bounds``, so many along each axis, cut by
+        predicates (M, D) -> (M,) of booleans, or signed distances. A cell belongs to the region that holds its middle,
+        to none where no region does; interfaces follow the sides of cells.
 
     Returns
     -------
@@ -78,6 +85,10 @@ def regions(
     (['boundary', 'disk|plate', 'interior'], 31)
     """
     _check_names(shapes)
+    if lattice is not None:
+        if spacing is not None or bounds is None:
+            raise ValueError("lattice: takes bounds (lo, hi) and no spacing, which its shape says already")
+        return cut_lattice(shapes, checked_bounds(bounds), lattice, groups)
     if spacing is None:
         raise ValueError("spacing: not given; give the distance between neighbouring particles")
     rule, seed = filling.spacing_function(spacing), checked_seed(seed)
@@ -210,7 +221,7 @@ def _meet(sketch: _Sketch) -> None:
     """Which shapes meet at every particle, and whether there is nothing on some side of it."""
     points, h = sketch.points, sketch.spacing(sketch.points)
     member = np.zeros((len(sketch.shapes), len(points)), bool)
-    probes = _directions(points.shape[1])
+    probes = directions(points.shape[1])
     names = list(sketch.shapes)
     inside = np.zeros((len(names), len(probes), len(points)), bool)
     for k, shape in enumerate(sketch.shapes.values()):
@@ -224,7 +235,7 @@ def _meet(sketch: _Sketch) -> None:
     for i, first in enumerate(names):
         for j in range(i + 1, len(names)):
             both = np.flatnonzero(member[i] & member[j])
-            both = both[np.flatnonzero(_share_a_side(inside[i], inside[j], member, both, points.shape[1]))]
+            both = both[np.flatnonzero(share_a_side(inside[i], inside[j], member, both, points.shape[1]))]
             if len(both):
                 sketch.interfaces[first, names[j]] = both
     count = member.sum(axis=0)
@@ -243,32 +254,6 @@ def _meet(sketch: _Sketch) -> None:
                 f"shapes: in 3D an interface ends or meets others near {at}; interfaces must be closed surfaces there, "
                 "as an inclusion's"
             )
-
-
-def _share_a_side(one: np.ndarray, two: np.ndarray, member: np.ndarray, at: np.ndarray, dim: int) -> np.ndarray:
-    """Mask of the particles ``at`` at which two shapes share a piece of boundary, not only that point.
-
-    Of the probes in a ring those of each shape follow one another; shapes that share a side have neighbouring ones.
-    """
-    if dim != 2:
-        return np.ones(len(at), bool)
-    a, b = one[:, at], two[:, at]
-    touch = (a & np.roll(b, 1, axis=0)) | (b & np.roll(a, 1, axis=0)) | (a & b)
-    return np.asarray(touch.any(axis=0))
-
-
-def _directions(dim: int) -> np.ndarray:
-    """Unit vectors to all sides."""
-    if dim == 1:
-        return np.array([[-1.0], [1.0]])
-    if dim == 2:
-        # Off the axes, along which boundaries often run.
-        angle = 2.0 * np.pi * (np.arange(_PROBES) + 0.37) / _PROBES
-        return np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    k = np.arange(_PROBES) + 0.5
-    z, angle = 1.0 - 2.0 * k / _PROBES, np.pi * (1.0 + 5.0**0.5) * k
-    radius = np.sqrt(1.0 - z * z)
-    return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)
 
 
 def _check_overlap(sketch: _Sketch, name: str, points: np.ndarray, h: np.ndarray) -> None:

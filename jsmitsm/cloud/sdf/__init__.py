@@ -38,7 +38,7 @@ from jsmitsm.cloud.sdf.combine import (
     union,
 )
 from jsmitsm.cloud.sdf.round_shapes import capsule, cylinder, ellipse, ellipsoid, torus
-from jsmitsm.cloud.sdf.vectors import corner_distance, known, norm, offset_from, positive, vector
+from jsmitsm.cloud.sdf.vectors import corner_distance, floats, known, norm, offset_from, positive, vector
 
 __all__ = [
     "ball",
@@ -158,7 +158,9 @@ def box(lo: Any, hi: Any) -> Sdf:
     lo = vector("lo", lo)
     hi = vector("hi", hi, np.shape(lo)[0])
     if known(lo) and known(hi) and not (hi > lo).all():
-        raise ValueError(f"hi: {hi} must be greater than lo = {lo} along every axis; swap the two corners")
+        raise ValueError(
+            f"hi: {hi} must be greater than lo = {lo} along every axis; swap the two corners (docs: clouds)"
+        )
     center, half = (lo + hi) / 2, (hi - lo) / 2
     return lambda x: corner_distance(jnp.abs(offset_from(x, center)) - half)
 
@@ -246,7 +248,7 @@ def half_space(point: Any, normal: Any) -> Sdf:
     point = vector("point", point)
     normal = vector("normal", normal, np.shape(point)[0])
     if known(normal) and not np.any(normal):
-        raise ValueError("normal: a zero vector came, a direction out of the half-space was expected")
+        raise ValueError("normal: a zero vector came, a direction out of the half-space was expected (docs: clouds)")
     unit = normal / (jnp if isinstance(normal, jax.core.Tracer) else np).linalg.norm(normal)
     return lambda x: jnp.dot(offset_from(x, point), unit)
 
@@ -279,9 +281,9 @@ def polygon(vertices: Any) -> Sdf:
     >>> float(js.sdf.polygon([(0, 0), (2, 0), (0, 2)])(jnp.array([0.5, -1.0])))
     1.0
     """
-    start = vertices if isinstance(vertices, jax.core.Tracer) else np.asarray(vertices, dtype=np.float64)
+    start = floats("vertices", vertices)
     if start.ndim != 2 or start.shape[1] != 2 or start.shape[0] < 3:
-        raise ValueError(f"vertices: shape {start.shape} came, (V, 2) with V >= 3 was expected")
+        raise ValueError(f"vertices: shape {start.shape} came, (V, 2) with V >= 3 was expected (docs: clouds)")
 
     def sdf(x: jax.Array) -> jax.Array:
         begin = jnp.asarray(start)

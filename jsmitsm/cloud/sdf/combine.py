@@ -254,7 +254,8 @@ def rotate(shape: Sdf, angle: Any, center: Any = None, axis: Any = None) -> Sdf:
     def sdf(x: jax.Array) -> jax.Array:
         if x.shape[0] == 1 or (x.shape[0] == 3) != (direction is not None):
             raise ValueError(
-                f"axis: {axis} came with a point in {x.shape[0]}D; 3D needs an axis (3,), 2D takes none, 1D has none"
+                f"axis: {axis} came with a point in {x.shape[0]}D; 3D needs an axis (3,), 2D takes none, 1D has none "
+                "(docs: clouds)"
             )
         c, s, y = jnp.cos(angle), jnp.sin(angle), x - middle
         if direction is None:
@@ -332,7 +333,9 @@ def shell(shape: Sdf, thickness: Any) -> Sdf:
 def _combine(pick: Callable[[jax.Array, jax.Array], jax.Array], shapes: Sequence[Sdf]) -> Sdf:
     """Fold the values of all shapes with min or max."""
     if not shapes or not all(map(callable, shapes)):
-        raise ValueError(f"shapes: expected one or more functions x -> scalar, got {shapes!r}; pass them one by one")
+        raise ValueError(
+            f"shapes: expected one or more functions x -> scalar, got {shapes!r}; pass them one by one (docs: clouds)"
+        )
 
     def sdf(x: jax.Array) -> jax.Array:
         value = shapes[0](x)

@@ -14,7 +14,7 @@ def offset_from(x: jax.Array, origin: Any) -> jax.Array:
     if jnp.shape(x) != jnp.shape(origin):
         raise ValueError(
             f"sdf: a shape in {len(origin)}D was asked at a point of shape {jnp.shape(x)}; bounds and points must have "
-            "its dimension"
+            "its dimension (docs: clouds)"
         )
     return x - origin
 
@@ -45,20 +45,30 @@ def vector(name: str, value: Any, dim: int | None = None) -> Any:
             else:
                 array = np.asarray(value, dtype=np.float64)
         except (TypeError, ValueError, OverflowError):
-            raise ValueError(f"{name}: expected {dim or 'D'} numbers, got {value!r}") from None
+            raise ValueError(f"{name}: expected {dim or 'D'} numbers, got {value!r} (docs: clouds)") from None
     if array.ndim != 1 or (dim is not None and array.shape != (dim,)) or array.shape[0] not in (1, 2, 3):
         expected = f"({dim},)" if dim else "(D,) with D = 1, 2 or 3"
-        raise ValueError(f"{name}: shape {array.shape} came, {expected} was expected")
+        raise ValueError(f"{name}: shape {array.shape} came, {expected} was expected (docs: clouds)")
     if known(array) and not np.isfinite(array).all():
-        raise ValueError(f"{name}: expected finite numbers, got {value!r}")
+        raise ValueError(f"{name}: expected finite numbers, got {value!r} (docs: clouds)")
     return array
+
+
+def floats(name: str, value: Any) -> Any:
+    """A float64 host array; traced values pass unchecked."""
+    if isinstance(value, jax.core.Tracer):
+        return value
+    try:
+        return np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError(f"{name}: expected numbers, got {value!r} (docs: clouds)") from None
 
 
 def positive(name: str, value: Any) -> Any:
     """A positive number (or array of them); traced values pass unchecked."""
-    if isinstance(value, jax.core.Tracer):
-        return value
-    array = np.asarray(value, dtype=np.float64)
+    array = floats(name, value)
+    if not known(array):
+        return array
     if not (np.isfinite(array).all() and (array > 0).all()):
-        raise ValueError(f"{name}: expected a positive finite length, got {value!r}")
+        raise ValueError(f"{name}: expected a positive finite length, got {value!r} (docs: clouds)")
     return array if array.ndim else float(array)

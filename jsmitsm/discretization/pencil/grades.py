@@ -18,6 +18,7 @@ from jsmitsm.discretization.health import DEFECT, LEBESGUE, balanced, kind_of, w
 from jsmitsm.discretization.layout import Discretization, rounded_width
 from jsmitsm.discretization.pencil.local import Part, part_of, widened
 from jsmitsm.particle.moments import Row
+from jsmitsm.runtime.collector import uncollected
 from jsmitsm.runtime.errors import some
 
 # The sources of all neighbours together may weigh so many times a particle's own, by the dimension.
@@ -45,17 +46,22 @@ class Fitness:
 
 
 class Grading:
-    """The grades of rows against those of most particles."""
+    """The grades of rows against those of most particles.
+
+    An equation goes with the field that it determines, in whatever order they are written.
+    """
 
     def __init__(self, disc: Discretization, parts: list[Part], massed: np.ndarray):
-        self.disc, self.massed = disc, massed
+        self.disc = disc
         blocks = np.concatenate([np.asarray(p.sources)[:, :, 0, :] for p in parts])
         inner = np.concatenate([disc.n_own[p.cls.ids] == 0 for p in parts])
         blocks = blocks[inner] if inner.any() else blocks
         size = np.linalg.norm(blocks, axis=(1, 2), keepdims=True)
-        self.usual = np.median(blocks / np.where(size > 0, size, 1.0), axis=0)  # (F, E)
-        if disc.part is not None:  # only its sign counts
-            self.usual = disc.part.total(np.nan_to_num(self.usual) * len(blocks))
+        usual = np.median(blocks / np.where(size > 0, size, 1.0), axis=0)  # (F, E)
+        if disc.part is not None:  # only signs and sizes beside one another count
+            usual = disc.part.total(np.nan_to_num(usual) * len(blocks))
+        self.of_field = _paired(np.abs(usual))
+        self.usual, self.massed = usual[:, self.of_field], massed[self.of_field]
         self.sizes = _sizes(disc, parts)
 
     def __call__(self, part: Part) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -72,7 +78,7 @@ class Grading:
 
     def _of_sources(self, part: Part) -> tuple[np.ndarray, np.ndarray]:
         """How the neighbours' sources weigh against the particle's own, and whether those have the usual sign."""
-        sources = np.nan_to_num(np.asarray(part.sources))
+        sources = np.nan_to_num(np.asarray(part.sources))[..., self.of_field]
         counts = self.massed & ~self.disc.held[part.cls.ids]  # (n, F)
         both = counts[:, :, None] & counts[:, None, :]
         unit = np.eye(len(self.massed))
@@ -99,6 +105,17 @@ def _sizes(disc: Discretization, parts: list[Part]) -> dict[Any, int]:
                 size = int((near >= 0).sum(axis=1).max())
                 found[kind, name] = max(size, found.get((kind, name), 0))
     return found if disc.part is None else disc.part.largest(found)
+
+
+def _paired(size: np.ndarray) -> np.ndarray:
+    """The equation of each field by the sizes (F, E) of the sources in its row."""
+    if len(size) == 1:
+        return np.zeros(1, int)
+    with uncollected():
+        from scipy.optimize import linear_sum_assignment
+
+    part = size / np.maximum(size.max(axis=0), 1e-300)
+    return linear_sum_assignment(np.log(np.maximum(part, 1e-12)), maximize=True)[1]
 
 
 def _regular(blocks: np.ndarray) -> np.ndarray:

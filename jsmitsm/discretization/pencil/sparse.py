@@ -94,7 +94,7 @@ def _product(form: _Form, values: Any, x: Any) -> Any:
     """Many products: by scipy wherever only derivatives are traced, so that nothing of entries by columns is made."""
     if is_traced(values, x):
         return _times(values, form.rows, form.cols, jnp.asarray(x), form.shape[0])
-    return jnp.asarray(Sparse(values, form.rows, form.cols, form.shape).host @ np.asarray(x))
+    return jax.device_put(Sparse(values, form.rows, form.cols, form.shape).host @ np.asarray(x))
 
 
 def _product_forward(form: _Form, values: Any, x: Any) -> tuple[Any, Any]:
@@ -107,7 +107,7 @@ def _product_backward(form: _Form, kept: Any, bar: Any) -> tuple[Any, Any]:
         _, back = jax.vjp(lambda v, y: _times(v, form.rows, form.cols, y, form.shape[0]), values, jnp.asarray(x))
         return back(bar)
     matrix, bar = Sparse(values, form.rows, form.cols, form.shape), np.asarray(bar)
-    return jnp.asarray(sampled(matrix, bar, np.asarray(x))), jnp.asarray(matrix.host_transposed @ bar)
+    return jax.device_put((sampled(matrix, bar, np.asarray(x)), matrix.host_transposed @ bar))
 
 
 _product.defvjp(_product_forward, _product_backward)
@@ -129,3 +129,20 @@ def combined(parts: list[tuple[Any, Sparse]]) -> tuple[Any, np.ndarray, np.ndarr
     xp = jnp if is_traced([(f, m.values) for f, m in parts]) else np
     values = xp.concatenate([f * xp.asarray(m.values) for f, m in parts])
     return values, np.concatenate([m.rows for _, m in parts]), np.concatenate([m.cols for _, m in parts])
+
+
+def product(first: Sparse, second: Sparse) -> Sparse:
+    """The product of two matrices; where JAX traces values, by all pairs of entries that meet."""
+    shape = first.shape[0], second.shape[1]
+    if not is_traced(first.values, second.values):
+        whole = (first.host @ second.host).tocoo()
+        rows, cols = (c.astype(int) for c in whole.coords)
+        return Sparse(whole.data, rows, cols, shape)
+    order = np.argsort(second.rows, kind="stable")
+    counts = np.bincount(second.rows, minlength=second.shape[0])
+    width, begin = counts[first.cols], (np.cumsum(counts) - counts)[first.cols]
+    one = np.repeat(np.arange(len(first.cols)), width)
+    two = order[np.arange(len(one)) - np.repeat(np.cumsum(width) - width, width) + begin[one]]
+    at, place = np.unique(first.rows[one] * shape[1] + second.cols[two], return_inverse=True)
+    values = jnp.zeros(len(at)).at[place].add(jnp.asarray(first.values)[one] * jnp.asarray(second.values)[two])
+    return Sparse(values, at // shape[1], at % shape[1], shape)

@@ -7,11 +7,12 @@ from typing import Any
 
 from jsmitsm.equation.bcs import Condition, checked_value
 from jsmitsm.runtime.arrays import ValueOrFunction
-from jsmitsm.runtime.errors import short
+from jsmitsm.runtime.errors import explaining, short
 
 INTERFACE = "interface"
 
 
+@explaining
 def interface(
     flux: Mapping[str, Callable[..., Any]] | None = None,
     jump: ValueOrFunction = 0.0,

@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from jsmitsm.runtime.errors import short
+from jsmitsm.runtime.errors import explaining, short
 from jsmitsm.runtime.tracers import is_traced
 
 
@@ -30,6 +30,7 @@ class Constraint:
         return "constraint(<function>)" if is_traced(self.value) else f"constraint(<function>, value={self.value})"
 
 
+@explaining
 def constraint(functional: Callable[..., Any], value: float = 0.0) -> Constraint:
     """A number made of the solution has a given value: an integral, a mean, a flux, the value at a point.
 
@@ -37,7 +38,8 @@ def constraint(functional: Callable[..., Any], value: float = 0.0) -> Constraint
     ----------
     functional : function
         ``functional(sol)`` returns a scalar, made by JAX of what the solution offers: ``sol.u``, ``sol(points)``,
-        ``sol.grad(points)``, ``sol.integral()``, ``sol.flux(group)``, ``sol.unknowns["name"]``.
+        ``sol.grad(points)``, ``sol.integral()``, ``sol.flux(group)``, ``sol.unknowns["name"]``; with several regions
+        ``sol(points, region="a")``, ``sol.integral(region="a")``, ``sol.flux("a|b", k, region="a")``.
     value : float
         What it must be, in the units of the functional.
 

@@ -1,4 +1,4 @@
-"""What only some problems have: constraints, global unknowns, complex values, point sources.
+"""What only some problems have: constraints, global unknowns, complex values, point sources, integral terms.
 
 All others have none of it, and take the usual path.
 """
@@ -14,6 +14,7 @@ import jax
 import numpy as np
 
 from jsmitsm.equation.unknowns.constraint import Constraint, checked_number
+from jsmitsm.equation.unknowns.integral import Kernels, kernels
 from jsmitsm.equation.unknowns.point_source import PointSource
 from jsmitsm.runtime.errors import short
 
@@ -21,21 +22,22 @@ from jsmitsm.runtime.errors import short
 @partial(
     jax.tree_util.register_dataclass,
     data_fields=["constraints", "unknowns", "sources"],
-    meta_fields=["complex_values"],
+    meta_fields=["complex_values", "kernels"],
 )
 @dataclass
 class Extras:
-    """Constraints, global unknowns with the numbers to start from, whether u is complex, and point sources."""
+    """Constraints, global unknowns with the numbers to start from, whether u is complex, point sources, integrals."""
 
     constraints: tuple[Constraint, ...]
     unknowns: dict[str, Any]
     complex_values: bool
     sources: tuple[PointSource, ...]
+    kernels: Kernels = ()
 
 
 def extras(
     constraints: Sequence[Constraint], unknowns: Mapping[str, Any] | None, dtype: Any,
-    sources: Sequence[PointSource], bcs: Mapping[str, Any],
+    sources: Sequence[PointSource], integral: Any, pde: Any, bcs: Mapping[str, Any],
 ) -> Extras | None:  # fmt: skip
     """What the user gave, judged; None for a problem without any of it."""
     given: list[Any] = list(constraints) if isinstance(constraints, (list, tuple)) else [constraints]
@@ -61,6 +63,12 @@ def extras(
     for k, source in enumerate(points):
         if not isinstance(source, PointSource):
             raise ValueError(f"sources[{k}]: expected js.point_source(x0, strength), got {short(source)}")
+    found = kernels(integral, pde)
+    if found and (points or complex_values):
+        raise ValueError(
+            "integral: integral terms are made for real problems without point sources; write a complex problem as two "
+            "fields"
+        )
     if points and (given or complex_values):
         raise ValueError("sources: point sources are made for real problems without constraints and global unknowns")
     if complex_values and given:
@@ -69,9 +77,9 @@ def extras(
         )
     if not complex_values:
         _refuse_complex(bcs)
-    if not (given or complex_values or points):
+    if not (given or complex_values or points or found):
         return None
-    return Extras(tuple(given), started, complex_values, tuple(points))
+    return Extras(tuple(given), started, complex_values, tuple(points), found)
 
 
 def _is_complex(dtype: Any) -> bool:
@@ -105,6 +113,8 @@ def refuse_extras(problem: Any) -> None:
         )
     if found is not None and found.sources:
         raise ValueError("problem: point sources are for js.solve alone; this is not made for them")
+    if found is not None and found.kernels:
+        raise ValueError("problem: integral terms are for js.solve alone; this is not made for them")
     if found is not None:
         raise ValueError(
             "problem: constraints and global unknowns are found by js.solve alone; this is not made for them"

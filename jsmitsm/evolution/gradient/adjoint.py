@@ -12,7 +12,6 @@ from functools import partial
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm.evolution.gradient import additive, radau
@@ -86,7 +85,7 @@ def _forward(plan: Plan, given: Inputs) -> tuple[Any, Any]:
             break
         out.append(step.y)
         tape.append(step.stages if keep else None)
-    return jnp.asarray(np.stack(out)), (semi, tape)
+    return jax.device_put(np.stack(out)), (semi, tape)
 
 
 def _recorded(plan: Plan, given: Inputs) -> Any:

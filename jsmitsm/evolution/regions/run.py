@@ -28,10 +28,7 @@ class RegionsRun(Run):
 
     def pencil(self, t: Any, u: Any) -> RegionsSemidiscrete:
         began = time.perf_counter()
-        massed = np.zeros(self.fields, bool)
-        for part in self.timed.parts.values():
-            for record in (*part.masses, part.rest):
-                massed |= record.pattern.any(axis=1) if record.slots else record.source != "zero"
+        massed = np.any([part.sourced for part in self.timed.parts.values()], axis=0)
         self.counts["pencils"] += 1
         with jax.ensure_compile_time_eval():
             semi = self._semidiscrete(t, self.order, massed, self.stencils)

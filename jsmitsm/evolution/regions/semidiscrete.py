@@ -8,11 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm.discretization.coefficients import conditions_of
+from jsmitsm.discretization.pencil.fits import local_fits
 from jsmitsm.discretization.regions.rows import spread
 from jsmitsm.equation.regions.between import between
 from jsmitsm.evolution.regions.timed import RegionsTimed
 from jsmitsm.evolution.space.local_fits import RegionsStateFit, StateFit
-from jsmitsm.evolution.space.semidiscrete import Semidiscrete, local_fits
+from jsmitsm.evolution.space.semidiscrete import Semidiscrete
 from jsmitsm.runtime.tracers import is_traced
 
 

@@ -44,12 +44,21 @@ class RegionsTimed:
     def rest(self) -> tuple[Any, ...]:
         return tuple(part.rest for part in self.parts.values())
 
+    @property
+    def apart(self) -> tuple[Any, ...]:
+        return tuple(part.apart for part in self.parts.values())
+
+    @property
+    def values(self) -> bool:
+        """Whether there are values of u apart from the operator in any region."""
+        return any(part.values for part in self.parts.values())
+
     def at(self, t: Any, params: Any = None) -> Problem:
         """The closed problem at a moment; params: others than its own."""
         return at_moment(self.problem, t, params)
 
     def mass(self, order: int, points: Any, params: Any) -> Any:
-        """Coefficients (N, E, F) of the rates of this order."""
+        """Coefficients (N, E, F) of the rates of this order; of order 0 those of values."""
         found = [part.mass(order, points[self.ids[name]], params) for name, part in self.parts.items()]
         fields = self.problem.fields
         return spread_values(found, list(self.ids.values()), (len(points), fields, fields))

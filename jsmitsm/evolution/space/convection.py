@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from jsmitsm.discretization.pencil.fits import local_fits
 from jsmitsm.equation.field import unit
-from jsmitsm.evolution.space.semidiscrete import Semidiscrete, local_fits
+from jsmitsm.evolution.space.semidiscrete import Semidiscrete
 
 # Cell Peclet numbers |v| h / eps: up to the first the recursion is stable, beyond the second nothing is.
 MODERATE, MOST = 2.0, 5.0
@@ -71,6 +72,19 @@ def flag_divergence(semi: Semidiscrete, start: Any, flags: list[str]) -> None:
         flags.append(
             f"The start is not free of divergence: div u is up to {left / size:.0%} of the largest slope; it diffuses "
             "as the velocities do, and the pressure answers to it."
+        )
+
+
+def flag_open(semi: Semidiscrete, flags: list[str]) -> None:
+    """A flag where the pressure has no condition that is known to serve."""
+    flow = semi.timed.flow
+    assert flow is not None
+    if flow.open:
+        names = ", ".join(map(repr, flow.open))
+        flags.append(
+            f"On {names} neither all velocities are given nor anything of the pressure, field {flow.pressure}, and "
+            "errors may be some percent there: give the pressure, as at an outlet, or its slope along the normal, as "
+            "the momentum equations have it."
         )
 
 

@@ -7,12 +7,15 @@ discretization, and from order 5 on some of them grow. So the divergence of the 
     u_t + N(u) + grad p = nu lap u    gives    div(N(u) + grad p) = 0,    with div u = 0 on the walls,
 
 without the viscous terms: what is left of a divergence then diffuses, (div u)_t = nu lap(div u), and dies out (Johnston
-and Liu, J. Comput. Phys. 199, 2004; Shirokoff and Rosales, J. Comput. Phys. 230, 2011).
+and Liu, J. Comput. Phys. 199, 2004; Shirokoff and Rosales, J. Comput. Phys. 230, 2011). On a plane along which the flow
+slips div u = 0 would say of its tangential velocity what the momentum equations say already; there those across it
+give the pressure's slope, for u_n = 0, its rate, its convection and its friction are zero.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -21,14 +24,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm.cloud.cloud import Cloud
-from jsmitsm.equation.bcs import condition, fix
+from jsmitsm.equation.bcs import Condition, condition, fix
 from jsmitsm.equation.closing import closed
 from jsmitsm.equation.field import RATE, total, unit
 from jsmitsm.equation.operators import divergence, dt, grad, partial
 from jsmitsm.equation.problem import Problem
 from jsmitsm.equation.traced import Traced
 from jsmitsm.equation.tracing import trace
-from jsmitsm.runtime.tracers import any_number
+from jsmitsm.runtime.tracers import any_number, is_traced
 from jsmitsm.taylor.multi_indices import add
 
 # Particles at which numbers of the equations are compared.
@@ -39,7 +42,8 @@ _LOOKS = 32
 class Flow:
     """What is what: the pressure's field and the constraint's equation, and by axis the velocity's field and equation.
 
-    floating: whether the pressure is determined up to a constant only.
+    floating: whether the pressure is determined up to a constant only. open: groups that neither hold the velocity nor
+    let it slip nor say anything of the pressure.
     """
 
     pressure: int
@@ -47,6 +51,7 @@ class Flow:
     velocity: tuple[int, ...]
     momentum: tuple[int, ...]
     floating: bool = False
+    open: tuple[str, ...] = ()
 
 
 def flow_of(stated: Problem, whole: Traced, cloud: Cloud) -> Flow | None:
@@ -132,10 +137,22 @@ def with_pressure_equation(stated: Problem, whole: Traced, flow: Flow, cloud: Cl
     def continuity(u: Any, x: Any, n: Any, p: Any) -> Any:
         return total(partial(u[k], unit(dim, i))(x) for i, k in enumerate(flow.velocity))
 
-    bcs = dict(stated.bcs)
+    def across(u: Any, x: Any, n: Any, p: Any) -> Any:
+        """The momentum equations along n where the velocities are zero."""
+        def still(slot: Any) -> Any:
+            k, b = slot
+            return jnp.zeros(()) if k >= RATE or k in flow.velocity else partial(u[k], b)(x)
+
+        rows = whole.written(x, still, p)
+        return total(n[i] * rows[e] for i, e in enumerate(flow.momentum))
+
+    bcs, loose = dict(stated.bcs), []
     for name, conditions in stated.bcs.items():
         if name in cloud.groups and name not in fixed and conditions[0].kind not in ("periodic", "fix", "free"):
-            bcs[name] = [*conditions, condition(continuity)]
+            held = {k for c in conditions if c.kind == "dirichlet" for k in _fields(c, stated.fields)}
+            slips = _slips(conditions, flow, cloud, name)
+            bcs[name] = [*conditions, condition(across if slips else continuity)]
+            loose += [] if slips or held >= set(flow.velocity) else [name]
     if floats:
         inner = np.asarray(cloud.groups["interior"])
         points = np.asarray(any_number(cloud.points))
@@ -145,7 +162,30 @@ def with_pressure_equation(stated: Problem, whole: Traced, flow: Flow, cloud: Cl
     made = Problem(_pde(whole, flow, dim, False), bcs, stated.fields, stated.params)
     _check_convection(made, flow, cloud)
     made.pde = _pde(whole, flow, dim, True)
-    return made, replace(flow, floating=floats)
+    return made, replace(flow, floating=floats, open=tuple(loose))
+
+
+def _fields(c: Condition, fields: int) -> tuple[int, ...]:
+    return tuple(range(fields)) if c.field is None else (c.field,)
+
+
+def _slips(conditions: Sequence[Condition], flow: Flow, cloud: Cloud, name: str) -> bool:
+    """Whether a group is a plane across an axis, with a zero velocity through it and no friction along it."""
+    if cloud.normals is None:
+        return False
+    normals = np.abs(np.asarray(any_number(cloud.normals))[np.asarray(cloud.groups[name])])
+    axis = int(np.argmax(normals[0]))
+    if not np.allclose(normals, np.eye(cloud.dim)[axis]):
+        return False
+    found = {c.field: (c.kind, c.parts.get("value")) for c in conditions}
+    return all(
+        found.get(k, ("", None))[0] == ("dirichlet" if i == axis else "neumann") and _zero(found[k][1])
+        for i, k in enumerate(flow.velocity)
+    )
+
+
+def _zero(value: Any) -> bool:
+    return not callable(value) and not is_traced(value) and not np.any(np.asarray(value))
 
 
 def _check_convection(made: Problem, flow: Flow, cloud: Cloud) -> None:

@@ -12,15 +12,14 @@ import numpy as np
 
 from jsmitsm.discretization.coefficients import conditions_of
 from jsmitsm.discretization.pencil.assemble import Pencil
-from jsmitsm.discretization.pencil.local import source_stencils
+from jsmitsm.discretization.pencil.fits import local_fits
 from jsmitsm.discretization.pencil.sparse import Sparse
-from jsmitsm.evolution.space.local_fits import LocalFits, StateFit
+from jsmitsm.evolution.space.local_fits import StateFit
 from jsmitsm.evolution.space.system import System
 from jsmitsm.evolution.space.timed import Timed
 from jsmitsm.evolution.steps.tableaux import Sampling
 from jsmitsm.runtime.collector import uncollected
 from jsmitsm.runtime.tracers import any_number, concrete, is_traced
-from jsmitsm.taylor.multi_indices import count
 
 # Steps from which on those to come are looked at together, and the numbers that this may take at a time.
 MANY, NUMBERS = 64, 4e6
@@ -42,6 +41,8 @@ class Semidiscrete:
         self.free, self.held = pencil.free, pencil.held
         stiff, source, given = pencil.A, pencil.B, pencil.Bg
         masses = [self._times_mass(source, j) for j in ((1, 2) if self.second else (1,))]
+        if timed.values:
+            stiff = _sum(stiff, self._times_mass(source, 0))
         if damping and self.second:
             masses[0] = _sum(masses[0], self._damping(masses[1], damping))
         elif damping:
@@ -115,7 +116,7 @@ class Semidiscrete:
         return Sparse(product.data, rows, cols, mass.shape)
 
     def _times_mass(self, source: Sparse, order: int) -> Sparse:
-        """B M: the source of a particle's equation from the rates of its fields."""
+        """B M: the source of a particle's equation from the rates of its fields, of order 0 from their values."""
         mass = self.timed.mass(order, self.points, (np.asarray(0.0), self.params))  # of t it is free
         fields, concrete = self.fields, not is_traced(mass, source.values)
         values, rows, cols = [], [], []
@@ -346,19 +347,6 @@ class Driver:
         last = k == len(self._starts) - 1
         index = np.append(np.arange(at, at + m), block[0].shape[1] - 1 if last else at + m)
         return [v[:, index] for v in block]
-
-
-def local_fits(disc: Any, degree: int, alone: bool = False) -> LocalFits:
-    """Polynomials of this degree around all particles; those of periodic partners are their lenders'.
-
-    alone: without the particle's own value, which they predict.
-    """
-    points = np.asarray(disc.cloud.points)
-    size = min(2 * count(disc.rec.dim, degree), len(points))
-    ids = np.flatnonzero(disc.partner == np.arange(len(points)))
-    near = source_stencils(disc, ids, size)[np.searchsorted(ids, disc.partner)]
-    owner = np.concatenate([np.arange(len(points)), disc.images.owner]).astype(int)
-    return LocalFits(np.asarray(disc.points), near, disc.partner[owner], degree, alone)
 
 
 def _sum(first: Sparse, second: Sparse) -> Sparse:

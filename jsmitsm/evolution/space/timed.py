@@ -2,9 +2,11 @@
 
 The residual R(u, x, t) is recorded once and seen in parts:
 
-    M2 u_tt + M1 u_t + L u + N(u, x, t) = 0
+    M2 u_tt + M1 u_t + L u + C u + N(u, x, t) = 0
 
-L holds the slots whose coefficients depend neither on u nor on t, N all the rest, the source too.
+L and C hold the slots whose coefficients depend neither on u nor on t, N all the rest, the source too. C are the values
+of u beside their derivatives: like the rates a source of the recursion, known at the particles. In it, their weight
+against that of the derivatives would grow with the stencil's square, and turn the sign of rows that look one way.
 """
 
 from __future__ import annotations
@@ -32,13 +34,15 @@ from jsmitsm.taylor.multi_indices import Slot
 
 # The time is the first leaf of the parameters.
 TIME = 0
+# What functions call the time and the normal.
+TIMES, NORMAL = ("t", "time"), ("n", "normal")
 
 
 @dataclass
 class Timed:
     """The parts of a problem in time; every record takes the parameters (t, params).
 
-    problem : closed, its pde the record of L. rest: N. masses: coefficients of the first and the second rate.
+    problem : closed, its pde the record of L. rest: N. masses: coefficients of the first and the second rate. apart: C.
     steady : whether neither N at u = 0 nor a condition depends on t.
     quasilinear : whether N holds derivatives of the order of an equation. space: the whole residual without rates.
     flow: of an incompressible flow, whose constraint has become an equation for the pressure.
@@ -48,6 +52,7 @@ class Timed:
     space: Traced
     rest: Traced
     masses: tuple[Traced, ...]
+    apart: Traced
     steady: bool
     quasilinear: bool
     flow: Flow | None = None
@@ -62,13 +67,26 @@ class Timed:
     def linear(self) -> bool:
         return not self.rest.slots
 
+    @property
+    def values(self) -> bool:
+        """Whether C is anything."""
+        return bool(self.apart.slots)
+
+    @property
+    def sourced(self) -> np.ndarray:
+        """The equations (E,) whose sources matter."""
+        found = np.zeros(self.problem.fields, bool)
+        for record in (*self.masses, self.apart, self.rest):
+            found |= record.pattern.any(axis=1) if record.slots else record.source != "zero"
+        return found
+
     def at(self, t: Any, params: Any = None) -> Problem:
         """The closed problem at a moment; params: others than its own."""
         return at_moment(self.problem, t, params)
 
     def mass(self, order: int, points: Any, params: Any) -> Any:
-        """Coefficients (N, E, F) of the rates of this order."""
-        record = self.masses[order - 1]
+        """Coefficients (N, E, F) of the rates of this order; of order 0 those of C."""
+        record = self.masses[order - 1] if order else self.apart
         n, fields = len(points), self.problem.fields
         columns: list[Any] = [np.zeros((n, fields))] * fields
         if record.slots:
@@ -102,21 +120,44 @@ def timed(problem: Problem, cloud: Cloud) -> Timed:
     rates = [[s for s in whole.slots if s[0] // RATE == j] for j in (1, 2)]
     _check_rates(rates, changing)
     _check_constraints(whole, problem.fields)
-    space = [s for s in whole.slots if s[0] < RATE]
+    apart = _apart(whole, changing)
+    space = [s for s in whole.slots if s[0] < RATE and s not in apart]
     linear = [s for s in space if s not in changing]
-    operator, rest, still, *masses = restricted(
-        whole, (linear, True), ([s for s in space if s in changing], False), (space, False), *((r, True) for r in rates)
-    )
+    operator, rest, still, *masses, values = restricted(
+        whole, (linear, True), ([s for s in space if s in changing], False), (space, False),
+        *((slots, True) for slots in (*rates, apart)),
+    )  # fmt: skip
     orders = [max((sum(b) for (_, b), p in zip(whole.slots, row) if p), default=-1) for row in whole.pattern]
     problem_in_time = closed(stated, whole)
     problem_in_time.pde = operator  # type: ignore[assignment]
     condition_moves = check_conditions(problem_in_time)
     return Timed(
-        problem_in_time, still, rest, tuple(masses),
+        problem_in_time, still, rest, tuple(masses), values,
         not source_moves and not condition_moves,
         any(m > max(o, 0) for m, o in zip(orders, operator.order)),
         flow,
     )  # fmt: skip
+
+
+def _apart(whole: Traced, changing: set[Slot]) -> list[Slot]:
+    """The slots of C: values in equations of second order and more, where these determine a field each without them."""
+    kind = np.array([(k // RATE, k % RATE, sum(b)) for k, b in whole.slots])
+    order = np.where(whole.pattern & (kind[:, 0] == 0), kind[:, 2], -1).max(axis=1, initial=-1)
+    leads = whole.pattern & (kind[:, 0] == 0) & ((kind[:, 2] == order[:, None]) | (order < 2)[:, None])
+    determined = np.stack([leads[:, kind[:, 1] == k].any(axis=1) for k in range(whole.fields)], axis=1)
+    if (_partners(determined) < 0).any():
+        return []
+    beside = ~(whole.pattern & (order < 2)[:, None]).any(axis=0)
+    return [s for s, one, m in zip(whole.slots, beside, kind) if one and not m[0] and not m[2] and s not in changing]
+
+
+def _partners(stands: np.ndarray) -> np.ndarray:
+    """The row of each column, none of them twice; -1 where there is none."""
+    with uncollected():
+        from scipy.sparse import csr_array
+        from scipy.sparse.csgraph import maximum_bipartite_matching
+
+    return maximum_bipartite_matching(csr_array(stands), perm_type="row")
 
 
 def _recorded(stated: Problem, dim: int) -> Traced:
@@ -153,11 +194,7 @@ def _check_constraints(whole: Traced, fields: int) -> None:
         return
     without = np.flatnonzero(~whole.pattern[:, kind > 0].any(axis=1))
     stands = np.array([whole.pattern[:, (kind == 0) & (field == k)].any(axis=1) for k in still], bool)[:, without]
-    with uncollected():
-        from scipy.sparse import csr_array
-        from scipy.sparse.csgraph import maximum_bipartite_matching
-
-    found = maximum_bipartite_matching(csr_array(stands), perm_type="column")
+    found = _partners(stands.T)
     if (found < 0).any():
         names = ", ".join(str(k) for k in still[found < 0])
         raise ValueError(
@@ -189,7 +226,7 @@ def check_conditions(problem: Problem) -> bool:
 
 
 def condition_in_time(c: Condition, with_params: bool, where: str) -> Condition:
-    forms = (("u, x, n, t", 4), ("u, x, t", 3)) if c.kind == "condition" else (("x, t", 2), ("x", 1))
+    forms = (("u, x, n, t", 4), ("u, x, n", 3), ("u, x, t", 3)) if c.kind == "condition" else (("x, t", 2), ("x", 1))
 
     def one(name: str, part: Any) -> Any:
         return in_time(part, with_params, forms, f"{where}.{name}", c.kind) if callable(part) else part
@@ -211,6 +248,8 @@ def in_time(function: Callable[..., Any], with_params: bool, forms: Any, where: 
     def last(p: Any) -> tuple[Any, ...]:
         return ((p[0],) if names.endswith("t") else ()) + ((p[1],) if with_params else ())
 
+    if names == "u, x, n" and kind == "condition":
+        return lambda u, x, n, p: function(u, x, n, *last(p))
     if names == "u, x, t" and kind == "condition":
         return lambda u, x, n, p: function(u, x, *last(p))
     if names.startswith("a, b"):
@@ -225,7 +264,8 @@ def in_time(function: Callable[..., Any], with_params: bool, forms: Any, where: 
 def _takes(function: Callable[..., Any], count: int, names: str) -> bool:
     """Whether a function takes so many arguments, those of these names.
 
-    Numbers kept in defaults, as in lambda x, c=c: c * x[0], do not take the place of the time.
+    Numbers kept in defaults, as in lambda x, c=c: c * x[0], do not take the place of the time. An argument called t is
+    the time and one called n the normal, and so no other.
     """
     try:
         signature = inspect.signature(function)
@@ -234,7 +274,16 @@ def _takes(function: Callable[..., Any], count: int, names: str) -> bool:
         return False
     except ValueError:  # a callable without a signature
         return True
-    at = len(names.split(", ")) - 1
-    given = list(signature.parameters.values())
-    return not (names.endswith("t") and at < len(given) and given[at].default is not inspect.Parameter.empty
-                and given[at].name not in ("t", "time"))  # fmt: skip
+    meant = names.split(", ")
+    given = list(signature.parameters.values())[:count]
+    if names == "u, x, n" and given[2].name not in NORMAL:
+        return False
+    for k, one in enumerate(given):
+        role = meant[k] if k < len(meant) else ""
+        if one.name in TIMES and one.default is inspect.Parameter.empty and role != "t":
+            return False
+        if one.name in NORMAL and role not in ("n", ""):
+            return False
+        if role == "t" and one.default is not inspect.Parameter.empty and one.name not in TIMES:
+            return False
+    return True

@@ -24,7 +24,7 @@ from jsmitsm.parallel.solving import refuse_others
 from jsmitsm.parallel.system import System, product
 from jsmitsm.parallel.team import Team, team
 from jsmitsm.runtime.arrays import ValueOrFunction
-from jsmitsm.runtime.errors import did_you_mean
+from jsmitsm.runtime.errors import did_you_mean, explaining
 
 # Schemes that are made for several processes.
 SCHEMES = {"auto": KENCARP4, "esdirk": KENCARP4, "euler": EULER}
@@ -80,6 +80,7 @@ class _TimedLocal(Local):
         return self.timed.at(np.asarray(self.t0))
 
 
+@explaining
 def evolve(
     problem: Problem, cloud: Cloud | ParallelCloud, u0: ValueOrFunction, t: tuple[float, float], *, steps: int,
     order: int = 4, scheme: str = "auto", save: Any = None, depth: int | str = "auto", solver: str = "auto",

@@ -19,7 +19,7 @@ from jsmitsm.parallel.solving import check_asked
 from jsmitsm.parallel.system import product
 from jsmitsm.parallel.team import Team, engine, team
 from jsmitsm.runtime.arrays import ValueOrFunction
-from jsmitsm.runtime.errors import SolveError
+from jsmitsm.runtime.errors import SolveError, explaining
 from jsmitsm.solution.arguments import Depth
 
 # Values sought beyond those asked for, the residual that ends the search, and its longest.
@@ -69,6 +69,7 @@ class ParallelModes:
         return f"ParallelModes({len(self)} of {self._local.mine.count} particles, {len(self._u)} of them here)"
 
 
+@explaining
 def eigen(
     problem: Problem, cloud: Cloud | ParallelCloud, count: int, *, near: float = 0.0,
     mass: ValueOrFunction | None = None, order: int = 6, depth: Depth = "auto",

@@ -11,7 +11,7 @@ from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.equation.problem import Problem
 from jsmitsm.particle.kernels import Kernel
 from jsmitsm.runtime.arrays import Array, ValueOrFunction
-from jsmitsm.runtime.errors import SolveError, explaining, is_whole
+from jsmitsm.runtime.errors import SolveError, explaining, is_whole, numbers
 from jsmitsm.runtime.progress import bar
 from jsmitsm.solution.arguments import SolveOptions
 from jsmitsm.solution.nonlinear.branch import Branch, follow
@@ -106,7 +106,7 @@ def continuation(
     >>> [round(float(sol.u[10]), 2) for sol in around], round(around.folds[0], 3)
     ([0.14, 0.33, 2.9], 3.514)
     """
-    values = np.asarray(parameters, float)
+    values = numbers("parameters", parameters)
     if values.ndim != 1 or len(values) < 2 or not np.isfinite(values).all():
         raise ValueError(f"parameters: expected two or more finite numbers in a row, got {parameters!r}")
     if not callable(problem):

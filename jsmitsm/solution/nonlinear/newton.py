@@ -1,8 +1,10 @@
 """Newton's method: it arrives from far, ends quadratically, and its end carries derivatives.
 
 The local fits solve the linearised recursion, so that a step from expansions U leads to values and expansions V with
-R(U) + R'(U) (V - U) = 0, for both together. What it lacks of a quadratic rate is the misfit of the fits, which falls
-with the order.
+R(U) + R'(U) (V - U) = 0, for both together. What it lacks of a quadratic rate is the misfit of the fits times the
+curvature of the equation, as in Gauss's and Newton's method for least squares: a step turns the local solutions among
+which the next fit is sought. It falls with the misfit (a driven cavity at order 6: 0.2 on 17 x 17 particles, 0.02 on
+27 x 27), and steps that end linearly are mixed.
 """
 
 from __future__ import annotations
@@ -33,7 +35,7 @@ SHORTEST, REFUSED = 1.0 / 16.0, 12
 ROUNDING, ROUND_OFF, STALLED = 10 * np.finfo(float).eps, 1e-6, 1e-7
 # Steps of less than CLOSE of the solution that fall to no less than SLOW of the one before converge linearly, and are
 # mixed with up to DEPTH that came before.
-SLOW, CLOSE, DEPTH = 0.25, 2e-2, 4
+SLOW, CLOSE, DEPTH = 0.05, 2e-2, 4
 # Where only the first full step tells how large the solution is, it may be this much larger than that.
 WARY = 0.01
 NOTHING = "the equation says nothing"
@@ -192,7 +194,8 @@ def _damped(record: Record, here: Iterate, target: Iterate) -> Found:
                 return found()
             else:
                 part, refused = part / 2.0, refused + 1
-        rate = next_length / length
+        # What a full step leaves of a difference; a mixed one is shorter than that tells.
+        rate = distance(after, target) / max(distance(new, here), np.finfo(float).tiny)
         record.rate = rate if part == 1.0 else record.rate
         slow = part == 1.0 and rate > SLOW and next_length < CLOSE * after.size
         history = [*(history[-DEPTH:] if slow else []), (new, after)]

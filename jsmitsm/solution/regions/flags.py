@@ -15,6 +15,8 @@ WEAK = 10.0
 # Around a point where regions meet, values that grow as a lower power of the distance than this are singular there, if
 # what they grow by in the nearest ring makes this part of the range. Smooth ones grow with power one at the least.
 POWER, PART = 0.75, 0.02
+# ... unless linear functions around it leave less than this of the change: unlike directions in two rings are no power.
+LINEAR = 0.1
 # The rings, in distances of the nearest neighbour.
 _RINGS = (1.6, 3.2)
 
@@ -77,19 +79,24 @@ def _corners(regions: Regions, points: np.ndarray) -> list[Meeting]:
 
 def _growth(regions: Regions, m: Meeting, points: np.ndarray, values: np.ndarray) -> tuple[float, float]:
     """The power of the distance with which the values change around a point, and by how much in the nearest ring."""
-    distances, changes = [], []
+    distances, changes, curved = [], [], []
     for i in m.copies:
         near = regions.near[i][regions.near[i] >= 0]
         near = near[near != i]
-        distances.append(np.linalg.norm(points[near] - points[i], axis=1))
-        changes.append(np.abs(values[near] - values[i]).max(axis=1))
+        way, rise = points[near] - points[i], values[near] - values[i]
+        distances.append(np.linalg.norm(way, axis=1))
+        close = distances[-1] <= _RINGS[1] * distances[-1].min()
+        slope = np.linalg.lstsq(way[close], rise[close], rcond=1e-9)[0]
+        changes.append(np.abs(rise).max(axis=1))
+        curved.append(np.abs(rise - way @ slope).max(axis=1))
     r, change = np.concatenate(distances), np.concatenate(changes)
     first = r <= _RINGS[0] * r.min()
     second = (r <= _RINGS[1] * r.min()) & ~first
     if first.sum() < 3 or second.sum() < 3:
         return np.inf, 0.0
     size = [float(np.sqrt((change[ring] ** 2).mean())) for ring in (first, second)]
-    if not size[0] or not size[1]:
+    rest = float(np.sqrt((np.concatenate(curved)[first] ** 2).mean()))
+    if not size[0] or not size[1] or rest <= LINEAR * size[0]:
         return np.inf, 0.0
     power = np.log(size[1] / size[0]) / np.log(r[second].mean() / r[first].mean())
     return float(power), size[0]

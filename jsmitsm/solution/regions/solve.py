@@ -21,9 +21,9 @@ from jsmitsm.solution.regions.solution import RegionsSolution
 def prepared_regions(
     problem: Any, cloud: Any, *, method: str = "S", order: int = 4, kernel: Any = None, stencils: Any = None,
     basis_terms: Any = None, formulation: str = "auto", solver: str = "auto", u0: Any = None, throw: bool = True,
-    depth: Any = 0,
+    depth: Any = 0, kind: type[RegionsRun] = RegionsRun, sources: bool = False,
 ) -> RegionsRun:  # fmt: skip
-    """Checked arguments of a solve, discretised."""
+    """Checked arguments of a solve, discretised; kind: of run that is made of them."""
     start = time.perf_counter()
     check(problem, cloud, method, order, kernel, stencils, formulation, solver, u0, throw, depth)
     if method != "S":
@@ -41,8 +41,8 @@ def prepared_regions(
             "stencils: the points are traced by a JAX transform, and neighbours are found on the host; build "
             "stencils = js.stencils(cloud, size=...) before the transform and pass stencils=stencils to solve"
         )
-    disc = discretize_regions(problem, cloud, order, depth, near, sources=False)
-    run = RegionsRun(disc, solver, throw, near is None)
+    disc = discretize_regions(problem, cloud, order, depth, near, sources=sources)
+    run = kind(disc, solver, throw, near is None)
     run.began, run.seconds["set-up"] = start, time.perf_counter() - start
     if disc.held.all():
         raise ValueError("problem: every particle's value is held; nothing is left to solve for")
@@ -62,7 +62,12 @@ def finished_regions(run: RegionsRun, values: Any, taylor: Any, good: Any, itera
     """The solution of a run that ended with these values and expansions (None: a linear problem)."""
     disc = run.disc
     run.seconds["total"] = time.perf_counter() - run.began
-    recipe = Recipe("S", disc.rec.order, None, "loo", disc.rec.fields, disc.rec.depth, tuple(disc.rec.orders))
+    recipe = regions_recipe(run)
     fit = RegionsFit(disc.problem, disc.cloud, whole_table(disc), taylor, recipe)
     report = None if is_traced(values) else run
     return RegionsSolution(values, disc.cloud, recipe, fit, good, iterations, run.stats(), report=report)
+
+
+def regions_recipe(run: RegionsRun) -> Recipe:
+    rec = run.disc.rec
+    return Recipe("S", rec.order, None, "loo", rec.fields, rec.depth, tuple(rec.orders))

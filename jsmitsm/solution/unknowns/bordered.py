@@ -13,21 +13,34 @@ data that balance.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
-from jsmitsm.discretization.layout import Discretization
+from jsmitsm.cloud.neighbours import Stencils
+from jsmitsm.discretization.coefficients import Numbers, numbers
+from jsmitsm.discretization.layout import Discretization, discretize, table
+from jsmitsm.discretization.least_squares import least_squares_right_side
+from jsmitsm.discretization.leave_one_out import right_side
 from jsmitsm.discretization.periodic import with_corners
+from jsmitsm.discretization.regions.layout import Regions, discretize_regions
+from jsmitsm.discretization.regions.rows import RegionNumbers, region_numbers, whole_right_side, whole_table
 from jsmitsm.equation.conditions import group_conditions
+from jsmitsm.equation.problem import Problem
 from jsmitsm.equation.unknowns.stated import at
+from jsmitsm.particle.recursion import Recursion
 from jsmitsm.runtime.tracers import is_traced
+from jsmitsm.solution.fit import Fit, Recipe
+from jsmitsm.solution.regions.fit import RegionsFit
+from jsmitsm.solution.regions.run import RegionsRun
 from jsmitsm.solution.run import Run
+from jsmitsm.solution.unknowns.integral import IntegralTerm
 
 
-class BorderedRun(Run):
+class Bordered(Run):
     """A linear solve with rows and columns more: ``columns`` (n, K), ``lines`` (K, n), ``corner`` (K, K)."""
 
     def __init__(self, *args: Any):
@@ -37,22 +50,78 @@ class BorderedRun(Run):
         self.corner: Any = np.zeros((0, 0))
         self.right: Any = np.zeros(0)
         self.system: tuple[Any, Any, Any] = (np.zeros(0), np.zeros(0, int), np.zeros(0, int))  # entries and places
-        self.parts: list[Any] = []  # of the least-squares form
+        self.squares: list[Any] = []  # parts of the least-squares form
         self.multipliers = False  # whether the columns are those of free constants
+        # The integral term of the problem, and the problem with it; ``problem`` is without.
+        self.term: IntegralTerm | None = None
+        self.whole: Problem | None = None
 
     @property
     def floating(self) -> tuple[int, ...]:
         return self.disc.floating if self.multipliers else ()
 
+    def assembled(self, nums: Any, parts: Any = None) -> tuple[Any, Any, Any, Any]:
+        data, r, c, b = super().assembled(nums, parts)
+        if self.term is None:
+            return data, r, c, b
+        if self.formulation == "lsq":
+            raise ValueError(
+                "integral: the equation takes the least-squares form, for which integral terms are not made; say "
+                'formulation="loo" where information does not travel'
+            )
+        self.term.assemble(self._right_of, lambda make: self.sources_alone(nums, make), self.disc.unknowns)
+        return *self._with_term(data, r, c), b + self.term.shift_of(nums.held)
+
+    def _with_term(self, data: Any, r: Any, c: Any) -> tuple[Any, Any, Any]:
+        """The entries of the matrix and those of the integral term."""
+        if self.term is None:
+            return data, r, c
+        block, n = self.term.block, len(self.term.block)
+        xp: Any = jnp if is_traced(data, block) else np
+        rows, columns = np.divmod(np.arange(n * n), max(n, 1))
+        return xp.concatenate([data, block.reshape(-1)]), np.concatenate([r, rows]), np.concatenate([c, columns])
+
+    def factor_of(self, data: Any, r: Any, c: Any) -> Any:
+        return super().factor_of(*self._with_term(data, r, c))
+
+    def right_of(self, nums: Any) -> Any:
+        """The right-hand side (n,) that belongs to the rows of the last step."""
+        right = self._right_of(nums)
+        return right if self.term is None else right + self.term.shift_of(nums.held)
+
+    def sources_alone(self, nums: Any, make: Callable[[str | None, Any, Recursion], Any]) -> Any:
+        """The numbers of the same operators without values of any kind, with other sources: see ``IntegralTerm``."""
+        raise NotImplementedError
+
+    def at(self, unknowns: dict[str, Any], values: Any) -> Problem:
+        """The problem with other unknowns; with an integral term that of these values (N, F)."""
+        if self.term is None or values is None:
+            return at(self.problem, unknowns)
+        assert self.whole is not None
+        return at(self.whole, unknowns, self.term.carried(values))
+
     @property
     def bordering(self) -> int:
         return len(self.corner)
 
-    def moved(self, unknowns: dict[str, Any]) -> Discretization:
-        """The discretisation of the problem with other unknowns."""
-        problem, disc = at(self.problem, unknowns), self.disc
-        groups = group_conditions(problem, with_corners(problem, disc.cloud), disc.rec.order, disc.traced.order)
-        return replace(disc, problem=problem, groups=groups)
+    def moved(self, unknowns: dict[str, Any], values: Any = None) -> Any:
+        """The discretisation of the problem with other unknowns, and with values (N, F) of its integral term."""
+        raise NotImplementedError
+
+    def numbers_of(self, disc: Any) -> Any:
+        """The numbers of one of these."""
+        raise NotImplementedError
+
+    def _right_of(self, nums: Any) -> Any:
+        raise NotImplementedError
+
+    def operators_of(self, nums: Any) -> list[Any]:
+        """All numbers that the matrix is made of."""
+        raise NotImplementedError
+
+    def fit(self, unknowns: dict[str, Any], values: Any, recipe: Recipe) -> Any:
+        """What fits the local polynomials of values that belong to these unknowns."""
+        raise NotImplementedError
 
     def constants(self) -> np.ndarray:
         """Columns of ones (n, K) for the fields that are free up to a constant."""
@@ -83,3 +152,69 @@ class BorderedRun(Run):
     def check_balance(self, taylor: Any = None) -> None:
         super().check_balance(taylor)
         self.messages = [m for m in self.messages if "its mean over the particles is 0" not in m]
+
+
+class BorderedRun(Bordered):
+    """In one region."""
+
+    def moved(self, unknowns: dict[str, Any], values: Any = None) -> Discretization:
+        problem, disc = self.at(unknowns, values), self.disc
+        if self.term is not None and values is not None:
+            near, rec = Stencils(table(disc), None), disc.rec
+            return discretize(problem, disc.cloud, disc.scheme.method, rec.order, None, near, None, depth=rec.depth)
+        groups = group_conditions(problem, with_corners(problem, disc.cloud), disc.rec.order, disc.traced.order)
+        return replace(disc, problem=problem, groups=groups)
+
+    def numbers_of(self, disc: Discretization) -> Numbers:
+        return numbers(disc, disc.problem)
+
+    def _right_of(self, nums: Numbers) -> Any:
+        if self.formulation == "lsq":
+            return least_squares_right_side(self.disc, nums, self.squares)
+        assert self.rows is not None
+        return right_side(self.disc, nums, *self.rows)
+
+    def operators_of(self, nums: Numbers) -> list[Any]:
+        return [nums.jac, nums.own, nums.data]
+
+    def sources_alone(self, nums: Numbers, make: Any) -> Numbers:
+        return _alone(nums, make(None, self.disc.cloud.points[nums.ids], self.disc.rec))
+
+    def fit(self, unknowns: dict[str, Any], values: Any, recipe: Recipe) -> Fit:
+        disc = self.disc
+        return Fit(self.at(unknowns, values), disc.cloud, disc.kernel, table(disc), None, recipe)
+
+
+class BorderedRegionsRun(Bordered, RegionsRun):
+    """In several regions."""
+
+    def moved(self, unknowns: dict[str, Any], values: Any = None) -> Regions:
+        disc = self.disc
+        problem, near, sources = self.at(unknowns, values), whole_table(disc), self.term is not None
+        return discretize_regions(problem, disc.cloud, disc.rec.order, disc.rec.depth, near, sources=sources)
+
+    def numbers_of(self, disc: Regions) -> RegionNumbers:
+        return region_numbers(disc)
+
+    def _right_of(self, nums: RegionNumbers) -> Any:
+        return whole_right_side(self.disc, nums, self.parts, self.bound)
+
+    def operators_of(self, nums: RegionNumbers) -> list[Any]:
+        each = [getattr(own, name) for own in nums.parts for name in ("jac", "own", "data")]
+        return [*each, *(coef for coef, _ in nums.between.values())]
+
+    def sources_alone(self, nums: RegionNumbers, make: Any) -> RegionNumbers:
+        parts = [
+            _alone(own, make(p.name, p.disc.cloud.points[own.ids], p.disc.rec))
+            for p, own in zip(self.disc.parts, nums.parts)
+        ]
+        between = {name: (coef, np.zeros(np.shape(value))) for name, (coef, value) in nums.between.items()}
+        return RegionNumbers(parts, between, np.zeros(np.shape(nums.held)))
+
+    def fit(self, unknowns: dict[str, Any], values: Any, recipe: Recipe) -> RegionsFit:
+        return RegionsFit(self.at(unknowns, values), self.disc.cloud, whole_table(self.disc), None, recipe)
+
+
+def _alone(nums: Numbers, source: Any) -> Numbers:
+    given, held, gamma = (np.zeros(np.shape(x)) for x in (nums.given, nums.held, nums.gamma))
+    return replace(nums, source=source, given=given, held=held, gamma=gamma)

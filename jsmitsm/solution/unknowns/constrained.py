@@ -11,18 +11,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jsmitsm.discretization.coefficients import Numbers, numbers
-from jsmitsm.discretization.layout import table
-from jsmitsm.discretization.least_squares import least_squares_right_side
-from jsmitsm.discretization.leave_one_out import right_side, with_held
+from jsmitsm.discretization.leave_one_out import with_held
 from jsmitsm.equation.problem import Problem
-from jsmitsm.equation.unknowns.stated import at, floats
+from jsmitsm.equation.unknowns.stated import floats
 from jsmitsm.runtime.errors import IN_FUNCTIONS, in_words
 from jsmitsm.runtime.progress import bar
 from jsmitsm.runtime.tracers import concrete, is_traced
 from jsmitsm.solution.fit import Fit, Recipe
-from jsmitsm.solution.unknowns.bordered import BorderedRun
-from jsmitsm.solution.unknowns.solution import ConstrainedSolution, Probe
+from jsmitsm.solution.regions.fit import RegionsFit
+from jsmitsm.solution.unknowns.bordered import Bordered, BorderedRegionsRun
+from jsmitsm.solution.unknowns.solution import (
+    ConstrainedRegionsSolution,
+    ConstrainedSolution,
+    Probe,
+    RegionsProbe,
+    WithUnknowns,
+)
 from jsmitsm.taylor.multi_indices import HIGHEST
 
 # A constraint is met when it misses by this part of what it is made of; round-off of the fits leaves 1e-12.
@@ -31,13 +35,11 @@ MET, STEPS = 1e-9, 20
 LINEAR = 1e-9
 
 
-@jax.tree_util.register_pytree_node_class
-class ConstrainedFit(Fit):
+class Compared:
     """A fit whose error estimate is the distance to the solution of another order, unknowns and all."""
 
-    def __init__(self, problem, cloud, kernel, neighbours, taylor, recipe, again=None):
-        super().__init__(problem, cloud, kernel, neighbours, taylor, recipe)
-        self.again: Callable[[int], Any] | None = again  # the values at another order
+    recipe: Recipe
+    again: Callable[[int], Any] | None = None  # the values at another order
 
     @bar("error estimate")
     def error_estimate(self, values: Any) -> Any:
@@ -51,19 +53,29 @@ class ConstrainedFit(Fit):
         return error[:, 0] if self.recipe.fields == 1 else error
 
 
+@jax.tree_util.register_pytree_node_class
+class ComparedFit(Compared, Fit):
+    """In one region."""
+
+
+@jax.tree_util.register_pytree_node_class
+class ComparedRegionsFit(Compared, RegionsFit):
+    """In several regions."""
+
+
 @dataclass
 class Response:
     """How the system answers to the unknowns: numbers at the start, change of right-hand side and held values."""
 
-    nums: Numbers
+    nums: Any
     right: Any  # (n,)
     columns: Any  # (n, K)
     held: Any  # (K, N, F)
 
 
 def solve_constrained(
-    problem: Problem, run: BorderedRun, recipe: Recipe, again: Callable[[int], Any]
-) -> ConstrainedSolution:
+    problem: Problem, run: Bordered, recipe: Recipe, again: Callable[[int], Any]
+) -> WithUnknowns:
     """The solution of a problem with constraints, from the run of its plain problem.
 
     recipe: of the solution, once the run has assembled; again: the values at another order.
@@ -71,15 +83,21 @@ def solve_constrained(
     assert problem.extras is not None
     constraints, start = problem.extras.constraints, floats(problem.extras.unknowns)
     _check(problem, run)
-    disc, names = run.disc, list(start)
-    run.multipliers = not names
+    disc, names, several = run.disc, list(start), isinstance(run, BorderedRegionsRun)
+    if run.term is not None:
+        run.term.weigh(disc.cloud, recipe.order)
+        run.solver = "dense" if run.solver == "auto" else run.solver
+    run.multipliers = not names and run.term is None
     answer = _response(run, start)
     recipe = replace(recipe, formulation=run.formulation)
+    if not constraints:
+        x, good = _solved(run, answer)
+        return _finished(run, answer, start, start, with_held(disc, answer.nums, x), good, 1, recipe, again)
 
     def missed(values: Any, unknowns: Any) -> Any:
         """By how much the constraints (K,) are missed."""
-        fit = Fit(at(run.problem, unknowns), disc.cloud, disc.kernel, table(disc), None, recipe)
-        probe = Probe(values, disc.cloud, recipe, fit, True, 1, {}, unknowns=unknowns)
+        made: Any = RegionsProbe if several else Probe
+        probe = made(values, disc.cloud, recipe, run.fit(unknowns, values, recipe), True, 1, {}, unknowns=unknowns)
         return jnp.stack([_value(c, probe, k) for k, c in enumerate(constraints)])
 
     run.columns = run.constants() if run.multipliers else -answer.columns
@@ -115,32 +133,45 @@ def solve_constrained(
     return _finished(run, answer, start, unknowns, values, good & met, step, recipe, again)
 
 
-def _finished(run, answer, start, unknowns, values, good, steps, recipe, again) -> ConstrainedSolution:
+def _finished(run, answer, start, unknowns, values, good, steps, recipe, again) -> WithUnknowns:
     """Judge what came out, and hand it on."""
     disc, names = run.disc, list(start)
-    problem = at(run.problem, unknowns)
-    traced = is_traced(values, unknowns)
+    traced, plain = is_traced(values, unknowns), run.fit(unknowns, values, recipe)
     if not traced:
-        values, run.disc, run.problem = np.asarray(values), run.moved(unknowns), problem
-        run.nums, run.values = run.numbers(), values
+        values = np.asarray(values)
         if names:
             _refuse_nonlinear(run, answer, start, unknowns)
+        run.disc = run.moved(unknowns, values)
+        run.problem = run.disc.problem
+        run.nums, run.values = run.numbers(), values
+        told = run.term and run.term.coarse()
+        if told:
+            run.object(told)
         if not bool(good) and not run.failed and np.isfinite(values).all():
             run.fail(f"the constraints are not met after {steps} step(s) of Newton's method; are they possible?")
         good = bool(good) and not run.failed and bool(np.isfinite(values).all())
     run.seconds["total"] = time.perf_counter() - run.began
-    own = ConstrainedFit(problem, disc.cloud, disc.kernel, table(disc), None, recipe, None if traced else again)
-    stats = run.stats()
-    return ConstrainedSolution(
+    several, stats = isinstance(run, BorderedRegionsRun), run.stats()
+    kind: Any = ComparedRegionsFit if several else ComparedFit
+    own = kind(*plain.tree_flatten()[0], recipe)
+    own.again = None if traced else again
+    return (ConstrainedRegionsSolution if several else ConstrainedSolution)(
         values, disc.cloud, recipe, own, good, steps, stats, report=None if traced else run, unknowns=unknowns
     )
 
 
-def _check(problem: Problem, run: BorderedRun) -> None:
+def _check(problem: Problem, run: Bordered) -> None:
     """As many constraints as unknowns, of a problem that is linear in u."""
     assert problem.extras is not None
     constraints, unknowns = problem.extras.constraints, problem.extras.unknowns
     floating = run.disc.floating
+    if not run.disc.linear and problem.extras.kernels:
+        raise ValueError(
+            "integral: the problem is nonlinear in u, and integral terms are made for linear ones; linearise it, and "
+            "repeat the solve with what it gave (a Picard iteration)"
+        )
+    if problem.extras.kernels and run.disc.scheme.method != "S":
+        raise ValueError(f'method: {run.disc.scheme.method} is not made for integral terms; use "S"')
     if not run.disc.linear:
         raise ValueError(
             "constraints: the problem is nonlinear in u, and constraints are made for linear ones; solve it for given "
@@ -148,7 +179,7 @@ def _check(problem: Problem, run: BorderedRun) -> None:
         )
     if run.disc.scheme.method in ("I", "II"):
         raise ValueError(f'method: {run.disc.scheme.method} is not made for constraints; use "S", "III" or "SSPH"')
-    wanted = len(unknowns) or len(floating)
+    wanted = len(unknowns) or (0 if problem.extras.kernels else len(floating))
     if len(constraints) != wanted:
         named = f" ({', '.join(unknowns)})" if unknowns else ""
         constant = f"; nothing else fixes the constant of {len(floating)} field(s), which take one each"
@@ -158,34 +189,27 @@ def _check(problem: Problem, run: BorderedRun) -> None:
         )
 
 
-def _response(run: BorderedRun, start: dict[str, Any]) -> Response:
+def _response(run: Bordered, start: dict[str, Any]) -> Response:
     """Assemble at the start, and once more for every unknown moved by one."""
     names = list(start)
     parts: list[Any] = []
     nums = run.numbers()
     data, r, c, right = run.assembled(nums, parts)
-    run.system, run.parts = (data, r, c), parts
+    run.system, run.squares = (data, r, c), parts
     columns, held = [], []
     for name in names:
         disc = run.moved({**start, name: start[name] + 1.0})
-        there = numbers(disc, disc.problem)
-        _refuse_in_operator(nums, there, name)
-        columns.append(_right(run, there) - right)
+        there = run.numbers_of(disc)
+        _refuse_in_operator(run.operators_of(nums), run.operators_of(there), name)
+        columns.append(run.right_of(there) - right)
         held.append((there.held - nums.held)[run.disc.partner])
     xp: Any = jnp if is_traced(columns, held) else np
     empty = np.zeros((len(right), 0)), np.zeros((0, *np.shape(nums.held)))
     return Response(nums, right, *((xp.stack(columns, 1), xp.stack(held)) if names else empty))
 
 
-def _right(run: BorderedRun, nums: Numbers) -> Any:
-    if run.formulation == "lsq":
-        return least_squares_right_side(run.disc, nums, run.parts)
-    assert run.rows is not None
-    return right_side(run.disc, nums, *run.rows)
-
-
-def _refuse_in_operator(one: Numbers, two: Numbers, name: str) -> None:
-    for a, b in ((one.jac, two.jac), (one.own, two.own), (one.data, two.data)):
+def _refuse_in_operator(one: list[Any], two: list[Any], name: str) -> None:
+    for a, b in zip(one, two, strict=True):
         a, b = concrete(a), concrete(b)
         if a is not None and b is not None and not np.array_equal(np.asarray(a), np.asarray(b)):
             raise ValueError(
@@ -194,12 +218,12 @@ def _refuse_in_operator(one: Numbers, two: Numbers, name: str) -> None:
             )
 
 
-def _refuse_nonlinear(run: BorderedRun, answer: Response, start: Any, unknowns: Any) -> None:
+def _refuse_nonlinear(run: Bordered, answer: Response, start: Any, unknowns: Any) -> None:
     """The unknowns must have entered as they were taken to."""
     away = np.array([float(unknowns[n] - start[n]) for n in start])
-    assert run.nums is not None
-    found = (answer.right, answer.columns @ away, _right(run, run.nums)), (
-        answer.nums.held, np.tensordot(away, answer.held, axes=1), run.nums.held
+    nums = run.numbers_of(run.moved(unknowns))
+    found = (answer.right, answer.columns @ away, run.right_of(nums)), (
+        answer.nums.held, np.tensordot(away, answer.held, axes=1), nums.held
     )  # fmt: skip
     for first, moved, there in found:
         size = max(np.abs(part).max(initial=0.0) for part in (first, moved, there))
@@ -210,7 +234,7 @@ def _refuse_nonlinear(run: BorderedRun, answer: Response, start: Any, unknowns: 
             )
 
 
-def _solved(run: BorderedRun, answer: Response) -> tuple[Any, Any]:
+def _solved(run: Bordered, answer: Response) -> tuple[Any, Any]:
     began = time.perf_counter()
     x, good = run.solved(*run.system, answer.right)
     run.seconds["solve"] += time.perf_counter() - began
@@ -219,7 +243,7 @@ def _solved(run: BorderedRun, answer: Response) -> tuple[Any, Any]:
     return x, bool(good) and bool(np.isfinite(x).all())
 
 
-def _value(c: Any, probe: Probe, k: int) -> Any:
+def _value(c: Any, probe: Any, k: int) -> Any:
     try:
         found = jnp.asarray(c.functional(probe))
     except IN_FUNCTIONS as error:

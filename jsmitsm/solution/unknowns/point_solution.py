@@ -9,10 +9,18 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm.cloud.cloud import Cloud
-from jsmitsm.equation.unknowns.point_source import Singular, derivative_of
+from jsmitsm.cloud.regions.region_cloud import RegionCloud
+from jsmitsm.equation.unknowns.point_source import Kelvin, Singular, derivative_of
 from jsmitsm.runtime.tracers import concrete
 from jsmitsm.solution.evaluation import checked_points, in_domain
+from jsmitsm.solution.regions.located import located
+from jsmitsm.solution.regions.solution import RegionsSolution
 from jsmitsm.solution.solution import Solution
+
+_TAYLOR = (
+    "coefficients: the Taylor series of a solution with point sources do not converge near them; ask "
+    "sol.regular.coefficients for those of the regular part"
+)
 
 
 @jax.tree_util.register_pytree_node_class
@@ -20,26 +28,24 @@ class PointSolution(Solution):
     """A solution that adds the singular part of its sources; estimates and flags are those of the regular part."""
 
     regular: Solution
-    singular: Singular
+    singular: Singular | Kelvin
 
     @classmethod
-    def of(cls, regular: Solution, singular: Singular) -> PointSolution:
+    def of(cls, regular: Solution, singular: Singular | Kelvin) -> PointSolution:
         """The solution whose regular part was solved for."""
         new = object.__new__(cls)
         new.__dict__.update(regular.__dict__)
         new.regular, new.singular = regular, singular
+        new.converged = _sound(regular, [singular])
         return new
 
     @property
     def u(self) -> Any:
-        return jnp.asarray(self._values[..., 0]) + jax.vmap(self.singular.at)(jnp.asarray(self.cloud.points))
+        return jnp.asarray(self.regular.u) + jax.vmap(self.singular.at)(jnp.asarray(self.cloud.points))
 
     @property
     def coefficients(self) -> Any:
-        raise ValueError(
-            "coefficients: the Taylor series of a solution with point sources do not converge near them; ask "
-            "sol.regular.coefficients for those of the regular part"
-        )
+        raise ValueError(_TAYLOR)
 
     def derivative(self, points: Any, multi_index: Any, *, blend: bool = False, outside: str = "nan") -> Any:
         regular = super().derivative(points, multi_index, blend=blend, outside=outside)
@@ -65,6 +71,63 @@ class PointSolution(Solution):
         return cls.of(*leaves) if isinstance(leaves[0], Solution) else _placeholder(cls, leaves)
 
 
+@jax.tree_util.register_pytree_node_class
+class RegionsPointSolution(RegionsSolution):
+    """The same in several regions: ``singular`` has the singular part of each of those that have sources."""
+
+    regular: RegionsSolution
+    singular: dict[str, Singular | Kelvin]
+
+    @classmethod
+    def of(cls, regular: RegionsSolution, singular: dict[str, Singular | Kelvin]) -> RegionsPointSolution:
+        """The solution whose regular part was solved for."""
+        new = object.__new__(cls)
+        new.__dict__.update({k: v for k, v in regular.__dict__.items() if k != "_regions"})
+        new.regular, new.singular = regular, singular
+        new.converged = _sound(regular, list(singular.values()))
+        return new
+
+    @property
+    def u(self) -> Any:
+        values = jnp.asarray(self.regular.u)
+        for name, part in self.singular.items():
+            ids = self.cloud.regions[name]
+            values = values.at[ids].add(jax.vmap(part.at)(jnp.asarray(self.cloud.points)[ids]))
+        return values
+
+    @property
+    def coefficients(self) -> Any:
+        raise ValueError(_TAYLOR)
+
+    def region(self, name: str) -> Solution:
+        return self._with_singular(name, self.regular.region(name))
+
+    def _one(self, name: str) -> Solution:
+        return self._with_singular(name, self.regular._one(name))
+
+    def _with_singular(self, name: str, part: Solution) -> Solution:
+        return PointSolution.of(part, self.singular[name]) if name in self.singular else part
+
+    def __repr__(self) -> str:
+        count = sum(len(part.places) for part in self.singular.values())
+        return f"{super().__repr__()[:-1]}, {count} point source(s))"
+
+    def tree_flatten(self):
+        return (self.regular, self.singular), None
+
+    @classmethod
+    def tree_unflatten(cls, _, leaves):
+        return cls.of(*leaves) if isinstance(leaves[0], Solution) else _placeholder(cls, leaves)
+
+
+def _sound(regular: Solution, parts: list[Singular | Kelvin]) -> Any:
+    """Whether the solve went well, and the singular parts are those of the operators."""
+    out = regular.converged
+    for part in parts:
+        out = out if part.sound is True else jnp.logical_and(out, part.sound)
+    return out
+
+
 def _placeholder(cls: type, leaves: Any) -> Any:
     """What JAX's tree tools make of a solution on their way, of parts that are none."""
     new: Any = object.__new__(cls)
@@ -72,12 +135,29 @@ def _placeholder(cls: type, leaves: Any) -> Any:
     return new
 
 
-def check_inside(singular: Singular, cloud: Cloud) -> None:
+def check_inside(sources: Any, cloud: Cloud) -> None:
     """ValueError for sources outside of the domain."""
-    places = concrete(singular.places)
-    if places is None or concrete(cloud.points) is None:
-        return
-    inside = in_domain(cloud, np.asarray(places), "nan")
+    places = [concrete(source.place) for source in sources]
+    if any(place is None or np.shape(place) != (cloud.dim,) for place in places) or concrete(cloud.points) is None:
+        return  # refused by name elsewhere, or not known
+    inside = in_domain(cloud, np.array(places, float), "nan")
     if inside is not None and not np.all(inside):
-        at = np.asarray(places)[np.flatnonzero(~np.asarray(inside))[0]]
-        raise ValueError(f"sources: x0 = {at} is outside of the domain; a point source lies inside of it")
+        at = places[np.flatnonzero(~np.asarray(inside))[0]]
+        raise ValueError(f"sources: x0 = {np.asarray(at)} is outside of the domain; a point source lies inside of it")
+
+
+def regions_of_sources(sources: Any, cloud: RegionCloud) -> list[str]:
+    """The region in which each source lies."""
+    check_inside(sources, cloud)
+    names, out = list(cloud.regions), []
+    for k, source in enumerate(sources):
+        place = concrete(source.place)
+        if place is None or concrete(cloud.points) is None:
+            raise ValueError(
+                f"sources[{k}]: x0 is traced by jax.jit or jax.vmap, and the region in which it lies is found on the "
+                "host; differentiate without jit"
+            )
+        if np.shape(place) != (cloud.dim,):
+            raise ValueError(f"sources[{k}]: x0 has {len(place)} coordinate(s), the cloud {cloud.dim}")
+        out.append(names[int(located(cloud, np.asarray(place, float)[None])[0])])
+    return out

@@ -6,11 +6,11 @@ from typing import Any
 
 import jax
 
+from jsmitsm.solution.regions.solution import RegionsSolution
 from jsmitsm.solution.solution import Solution
 
 
-@jax.tree_util.register_pytree_node_class
-class ConstrainedSolution(Solution):
+class WithUnknowns(Solution):
     """A solution, and the global unknowns that were found with it."""
 
     def __init__(self, *args: Any, unknowns: dict[str, Any], **more: Any):
@@ -36,7 +36,17 @@ class ConstrainedSolution(Solution):
         return new
 
 
-class Probe(ConstrainedSolution):
+@jax.tree_util.register_pytree_node_class
+class ConstrainedSolution(WithUnknowns):
+    """In one region."""
+
+
+@jax.tree_util.register_pytree_node_class
+class ConstrainedRegionsSolution(WithUnknowns, RegionsSolution):
+    """In several regions."""
+
+
+class Probing(Solution):
     """A solution on its way through a functional: its polynomials are fitted once, traced or not."""
 
     _made: Any = None
@@ -46,3 +56,11 @@ class Probe(ConstrainedSolution):
         if self._made is None:
             self._made = self._fit.coefficients(self._values)
         return self._made
+
+
+class Probe(Probing, ConstrainedSolution):
+    """In one region."""
+
+
+class RegionsProbe(Probing, ConstrainedRegionsSolution):
+    """In several regions."""
