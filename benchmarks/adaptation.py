@@ -86,6 +86,27 @@ def check(rows: list[dict[str, Any]]) -> list[str]:
     ]
 
 
+def table(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """For the documentation; problems in the order of their list."""
+    lines = []
+    for row in sorted((r for r in rows if "failed" not in r), key=lambda r: (list(CASES).index(r["case"]), -r["tol"])):
+        other = row.get("elements")
+        ratio = f"{row['estimate'] / row['true']:.2f}" if row["true"] else ""
+        fem = ["", ""]
+        if other:
+            fem = [f"{other['unknowns']}{'' if other['reached'] else ' (not)'}", f"{other['seconds']:.1f}"]
+        reached = "yes" if row["reached"] else "no"
+        lines.append([
+            row["name"], f"{row['tol']:.0e}", reached, f"{row['true']:.1e}", ratio, row["particles"], row["order"],
+            row["rounds"], f"{row['seconds']:.0f}", *fem,
+        ])  # fmt: skip
+    columns = ["problem", "tolerance", "reached", "true error", "estimate / true", "particles", "order", "rounds",
+               "seconds", "elements: unknowns", "seconds"]  # fmt: skip
+    about = describe()
+    note = f"{about['processor']}, {about['cores']} cores, JAX {about['jax']}; the machine was busy, seconds are rough."
+    return {"columns": columns, "rows": lines, "note": note}
+
+
 def main() -> None:
     jax.config.update("jax_enable_x64", True)
     parser = argparse.ArgumentParser(description=__doc__)
@@ -113,7 +134,8 @@ def main() -> None:
                 row["elements"] = beside(name, tol, given.most)
             print(shown(row), flush=True)
             rows = [r for r in kept(given.out) if (r["case"], r["tol"]) != (name, tol)] + [row]
-            given.out.write_text(json.dumps({"machine": describe(), "rows": rows}, indent=1) + "\n")
+            written = {"machine": describe(), "rows": rows, "tables": {"adaptation": table(rows)}}
+            given.out.write_text(json.dumps(written, indent=1) + "\n")
     for line in check(kept(given.out)):
         print(f"WRONG: {line}")
 

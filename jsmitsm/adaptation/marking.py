@@ -13,7 +13,7 @@ SAFETY = 0.4
 # A spacing changes by at most these factors in a round: refined where the solution is smooth, where it is known not to
 # be, and coarsened: freely where the error says nothing yet, later gently, and not at all within some factor of what is
 # wanted, or rounds would undo each other.
-FINER, SINGULAR, COARSER, GENTLY, FAR = 0.3, 0.05, 3.0, 1.4, 10.0
+FINER, SINGULAR, COARSER, GENTLY, FAR = 0.3, 0.05, 3.0, 1.4, 3.0
 # Where refining helped with less than this part of the expected power, the solution is not smooth.
 _ROUGH = 0.6
 _SLOWEST = 0.35

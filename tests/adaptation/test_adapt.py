@@ -177,7 +177,7 @@ def test_near_the_tolerance_no_spacing_grows():
     """What was coarsened there had to be refined again, round after round."""
     eta = np.where(np.arange(100) < 50, 1.0, 1e-9)
     marks = Marks(np.linspace(0.0, 1.0, 100)[:, None], np.full(100, 0.01), eta, np.full(100, 5.0), np.zeros(100, bool))
-    assert next_spacing(marks, 5.0, 1e-2, 2e-3, 100_000)[0].max() == pytest.approx(0.01)
+    assert next_spacing(marks, 5.0, 5e-3, 2e-3, 100_000)[0].max() == pytest.approx(0.01)
     assert next_spacing(marks, 5.0, 1e-1, 2e-3, 100_000)[0].max() > 0.013
 
 
