@@ -43,20 +43,12 @@ def _misses(local: Local, layout: Layout) -> float:
     return worst
 
 
-def own_rows(local: Local, pencil: Pencil, matrix: Sparse, columns: Any = None) -> Any:
-    """Rows of own free values against all free values, as a matrix of PETSc's; columns (N F,): factors of columns."""
+def own_rows(local: Local, matrix: Sparse) -> Any:
+    """The own rows of a matrix over the local free values, as a matrix of PETSc's over those of all processes."""
     from scipy import sparse
 
-    fields = local.disc.rec.fields
-    number = np.full(local.disc.held.size, -1)
-    number[pencil.free] = local.place[local.disc.unknowns.reshape(-1)[pencil.free]]
-    keep = np.flatnonzero(
-        local.halo.own[matrix.rows // fields] & (number[matrix.rows] >= 0) & (number[matrix.cols] >= 0)
-    )
-    values = np.asarray(matrix.values)[keep]
-    if columns is not None:
-        values = values * columns[matrix.cols[keep]]
-    at = number[matrix.rows[keep]] - local.first, number[matrix.cols[keep]]
-    block = sparse.csr_array((values, at), shape=(local.count, local.size))
+    keep = np.flatnonzero(local.owned[matrix.rows])
+    at = local.place[matrix.rows[keep]] - local.first, local.place[matrix.cols[keep]]
+    block = sparse.csr_array((np.asarray(matrix.values)[keep], at), shape=(local.count, local.size))
     block.sum_duplicates()
     return distributed(local.team, local.count, [Block(np.arange(local.count), block)])

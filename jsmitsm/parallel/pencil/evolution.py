@@ -244,8 +244,7 @@ class _System:
 
     def __init__(self, us: Team, local: Local, semi: Semidiscrete, solver: str):
         self.us, self.solver = us, solver
-        pencil, mass = semi.pencil, semi._times_mass(semi.pencil.B, 1)
-        self.stiffness, self.masses = own_rows(local, pencil, pencil.A), own_rows(local, pencil, mass)
+        self.stiffness, self.masses = (own_rows(local, m) for m in (semi.system.stiffness, semi.system.masses[0]))
         self._still = np.diff(self.masses.getValuesCSR()[0]) == 0
         self._resolvents: dict[float, System] = {}
 

@@ -11,7 +11,7 @@ from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.discretization.pencil.assemble import default_depth
 from jsmitsm.equation.problem import Problem
 from jsmitsm.modes.eigen import check_question, refuse_data
-from jsmitsm.modes.mass import is_operator, masses
+from jsmitsm.modes.mass import is_operator, masses, weighted
 from jsmitsm.parallel.distributed import ParallelCloud, bisected, slab_of
 from jsmitsm.parallel.local import Local, Settings
 from jsmitsm.parallel.pencil.assemble import own_rows, pencil_of_part
@@ -109,7 +109,7 @@ def eigen(
         check_asked(problem, cloud, "S", order, depth, None, "auto", "auto")
         check_question(problem, count, near, "S")
         if callable(mass) and is_operator(problem, mass):
-            raise ValueError("mass: an operator (u, x) is not made for several processes; use js.eigen on one")
+            raise ValueError("mass: an operator, a function of (u, x), is not made for several processes; use js.eigen")
         engine("slepc4py.SLEPc")
     slab = slab_of(us, cloud)
     settings = Settings("S", order, default_depth(depth, slab.dim), None, True, "loo", True)
@@ -123,8 +123,8 @@ def eigen(
     with us.phase():
         refuse_data(local.disc, pencil)
         weights, _ = masses(problem, local.cloud, mass)
-    a = own_rows(local, pencil, pencil.A)
-    c = own_rows(local, pencil, pencil.B, np.asarray(weights).reshape(-1))
+        stiff, inert = pencil.A.part(pencil.free, pencil.free), weighted(problem, pencil, weights)
+    a, c = own_rows(local, stiff), own_rows(local, inert)
     made = time.perf_counter()
     values, vectors, residuals = _found(us, a, c, count, float(near), 10.0 ** -(order / 2 + 1))
     u = np.zeros((*local.disc.held[local.halo.ids].shape, len(values)), vectors.dtype)
