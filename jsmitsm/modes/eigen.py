@@ -113,6 +113,7 @@ def eigen(
     pencil = assembled(problem, cloud, order=order, mass=tuple(massed), stencils=stencils, depth=depth)
     disc = pencil.layout.disc
     refuse_data(disc, pencil)
+    refuse_mass(pencil, massed)
     fields = problem.fields
     local = time.perf_counter()
     pattern, stiff, inert = reduced(pencil, problem, weights)
@@ -209,6 +210,21 @@ def refuse_data(disc: Discretization, pencil: Pencil) -> None:
                 f"bcs: {_culprit(disc)} a value other than zero, but the conditions of modes are homogeneous; set "
                 "the values to 0.0"
             )
+
+
+def refuse_mass(pencil: Pencil, massed: np.ndarray) -> None:
+    """A mass at a field that its equation lacks, and of which none has a derivative: nothing makes it a function."""
+    for one, _ in operators(pencil):
+        traced = one.traced
+        for k in np.flatnonzero(massed):
+            mine = [s for s, (field, _) in enumerate(traced.slots) if field == k]
+            derived = any(sum(traced.slots[s][1]) for s in mine)
+            if not derived and not any(traced.pattern[k][s] for s in mine):
+                raise ValueError(
+                    f"mass: equation {k} has one, which multiplies u[{k}], but neither has that equation u[{k}] in it, "
+                    f"nor any one a derivative of it; write the operator that u[{k}] stands for as the mass, as in "
+                    "mass=lambda u, x: -js.laplacian(u)(x)"
+                )
 
 
 def _culprit(disc: Discretization) -> str:
