@@ -188,6 +188,8 @@ def _damped(record: Record, here: Iterate, target: Iterate) -> Found:
                 return found(True)
             if len(history) > 1:
                 history = history[-1:]
+            elif part == 1.0 and length <= GOOD * target.size:
+                return found()
             elif after is not None and length < CLOSE * target.size and frozen.more(here, target):
                 continue
             elif part <= SHORTEST or refused == REFUSED:
