@@ -62,7 +62,15 @@ class Grading:
             usual = disc.part.total(np.nan_to_num(usual) * len(blocks))
         self.of_field = _paired(np.abs(usual))
         self.usual, self.massed = usual[:, self.of_field], massed[self.of_field]
-        self.sizes = _sizes(disc, parts)
+        self._whole = None if disc.part is None else _sizes_of_the_whole(disc, parts)
+
+    def sizes(self, part: Part) -> tuple[int, int]:
+        """The largest stencils that a class and its sources have, by which they are widened."""
+        if self._whole is None:
+            found = _sizes(part)
+            return found["near"], found["far"]
+        kind = kind_of(part.cls.scheme, part.cls.wide)
+        return self._whole[kind, "near"], self._whole[kind, "far"]
 
     def __call__(self, part: Part) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Grades (n,), Lebesgue constants, dominance and whether the sign is wrong."""
@@ -95,16 +103,21 @@ class Grading:
         return dominance, wrong
 
 
-def _sizes(disc: Discretization, parts: list[Part]) -> dict[Any, int]:
-    """The largest stencils of every kind of class, and of its sources; in a part of a cloud those of the whole."""
+def _sizes(part: Part) -> dict[str, int]:
+    """The largest stencil of a class, and of its sources."""
+    return {name: int((near >= 0).sum(axis=1).max())
+            for name, near in (("near", part.cls.neighbours), ("far", part.far)) if near is not None}  # fmt: skip
+
+
+def _sizes_of_the_whole(disc: Discretization, parts: list[Part]) -> dict[Any, int]:
+    """The same of every kind of class, in the whole of a cloud of which this is a part."""
     found: dict[Any, int] = {}
     for part in parts:
         kind = kind_of(part.cls.scheme, part.cls.wide)
-        for name, near in (("near", part.cls.neighbours), ("far", part.far)):
-            if near is not None:
-                size = int((near >= 0).sum(axis=1).max())
-                found[kind, name] = max(size, found.get((kind, name), 0))
-    return found if disc.part is None else disc.part.largest(found)
+        for name, size in _sizes(part).items():
+            found[kind, name] = max(size, found.get((kind, name), 0))
+    assert disc.part is not None
+    return disc.part.largest(found)
 
 
 def _paired(size: np.ndarray) -> np.ndarray:
@@ -164,7 +177,7 @@ def _repaired(
     """Weak particles of one class with better stencils; those that no stencil mends follow their neighbours."""
     points = disc.images.searched(np.asarray(disc.cloud.points))
     assert part.far is not None
-    size, far_size = (grading.sizes[kind_of(part.cls.scheme, part.cls.wide), name] for name in ("near", "far"))
+    size, far_size = grading.sizes(part)
     most = min(len(points), round(2.2 * size)), min(len(points), round(2.2 * far_size))
     near, far = (widened(x, rounded_width(m, 16)) for x, m in zip((part.cls.neighbours, part.far), most))
     far = part.far if far_size == 1 else far
