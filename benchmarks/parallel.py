@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import gc
 import json
-import sys
 import tempfile
 import threading
 import time
@@ -20,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks import machine
+from benchmarks.commandline import arguments
 
 DATA = Path(__file__).parent / "data" / "parallel.json"
 ORDER, JITTER = 4, 0.3
@@ -169,8 +169,8 @@ def keep(what: str, rows: list[dict[str, Any]]) -> None:
     DATA.write_text(json.dumps(data, indent=1) + "\n")
 
 
-def main() -> None:
-    if sys.argv[1:] == ["parts"]:
+def main(names: list[str]) -> None:
+    if names == ["parts"]:
         keep("parts", [dealt(DEALT, parts) for parts in PARTS])
         return
     import jax
@@ -181,7 +181,7 @@ def main() -> None:
     us = team()
     folder = us.gather(tempfile.mkdtemp() if us.rank == 0 else "")[0]
     solved(12, folder)  # compiles, and imports what is imported late
-    for count in map(int, sys.argv[1:]):
+    for count in map(int, names):
         row = solved(count, folder)
         if us.rank == 0:
             print(json.dumps(row), flush=True)
@@ -189,4 +189,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    main(arguments(__doc__, names="particles along an axis, or parts").names)
