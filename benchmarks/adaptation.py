@@ -101,7 +101,8 @@ def table(rows: list[dict[str, Any]]) -> dict[str, Any]:
     columns = ["problem", "tolerance", "reached", "true error", "estimate / true", "particles", "order", "rounds",
                "elements: unknowns"]  # fmt: skip
     about = describe()
-    note = f"{about['processor']}, {about['cores']} cores, JAX {about['jax']}; seconds are in the data, of a busy machine."
+    where = f"{about['processor']}, {about['cores']} cores, JAX {about['jax']}"
+    note = f"{where}; seconds are in the data, of a busy machine."
     return {"columns": columns, "rows": lines, "note": note}
 
 
