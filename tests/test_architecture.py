@@ -23,7 +23,10 @@ MAY_IMPORT = {
     "modes": ("runtime", "taylor", "particle", "cloud", "equation", "linear", "discretization", "solution"),
     "tuning": ("runtime", "taylor", "particle", "cloud", "equation", "linear", "discretization", "solution"),
     "show": ("runtime", "taylor", "particle", "cloud", "equation", "linear", "discretization", "solution"),
-    "parallel": ("runtime", "taylor", "particle", "cloud", "equation", "linear", "discretization", "solution", "show"),
+    "parallel": (
+        "runtime", "taylor", "particle", "cloud", "equation", "linear", "discretization", "solution", "evolution",
+        "modes", "show",
+    ),  # fmt: skip
 }
 
 

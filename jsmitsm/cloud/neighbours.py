@@ -34,6 +34,8 @@ _JUMP = 2.2
 _ALL_PAIRS, _ROWS = 2048, 128
 # Searches for fewer particles are done before a second core would have begun.
 _MANY = 4000
+# Particles whose neighbours are searched at a time.
+_BLOCK = 1 << 14
 
 
 @jax.tree_util.register_dataclass
@@ -146,15 +148,31 @@ def nearest(points: np.ndarray, size: int, which: np.ndarray | None = None) -> S
             f"size: {size} neighbours asked for, but the cloud has only {n} particles; lower the order or add particles"
         )
     centres = points if which is None else points[which]
-    distance, index = _with_ties(_searcher(points), centres, size)
+    tree = _searcher(points)
     _once.clear()
-    radius = distance[:, size - 1] * (1 + _TIE)
-    inside = distance <= radius[:, None]
-    if inside[:, -1].any() and distance.shape[1] < n:  # more ties than were looked for
-        return _ragged(points, centres, radius, which)
-    width = int(inside.sum(axis=1).max())
-    index = np.where(inside[:, :width], index[:, :width], -1).astype(np.int32)
+    # Block by block, in the order of the tree's leaves: of what a search finds little is kept.
+    order = tree.indices if which is None and n > _BLOCK else np.arange(len(centres))
+    radius, found = np.empty(len(centres)), []
+    for some in np.split(order, range(_BLOCK, len(order), _BLOCK)):
+        distance, near = _with_ties(tree, centres[some], size)
+        radius[some] = distance[:, size - 1] * (1 + _TIE)
+        inside = distance <= radius[some, None]
+        if inside[:, -1].any() and distance.shape[1] < n:  # more ties than were looked for
+            radius = _radius(tree, centres, size)
+            return _ragged(points, centres, radius, which)
+        width = int(inside.sum(axis=1).max())
+        found.append((some, np.where(inside[:, :width], near[:, :width], -1).astype(np.int32)))
+    index = found[0][1] if len(found) == 1 else np.full((len(centres), max(x.shape[1] for _, x in found)), -1, np.int32)
+    if len(found) > 1:
+        for some, part in found:
+            index[some, : part.shape[1]] = part
     return Stencils(_self_first(index, which), radius)
+
+
+def _radius(tree: Any, centres: np.ndarray, size: int) -> np.ndarray:
+    """The distance (n,) within which every centre has ``size`` particles, with their ties."""
+    blocks = np.split(centres, range(_BLOCK, len(centres), _BLOCK))
+    return np.concatenate([_query(tree, some, size)[0][:, size - 1] for some in blocks]) * (1 + _TIE)
 
 
 def replaced(stencils: Stencils, ids: np.ndarray, others: Stencils) -> Stencils:
@@ -213,8 +231,12 @@ def jumps(radius: np.ndarray, neighbours: np.ndarray) -> np.ndarray:
 
     The radius of as many neighbours doubles from inside to a corner; more is a jump.
     """
-    there = radius[np.where(neighbours >= 0, neighbours, neighbours[:, :1])]
-    return np.flatnonzero((there.min(axis=1) < radius / _JUMP) | (there.max(axis=1) > radius * _JUMP))
+    least, most, own = radius.copy(), radius.copy(), neighbours[:, 0]
+    for column in neighbours.T:
+        there = radius[np.where(column >= 0, column, own)]
+        np.minimum(least, there, out=least)
+        np.maximum(most, there, out=most)
+    return np.flatnonzero((least < radius / _JUMP) | (most > radius * _JUMP))
 
 
 _once = {"all pairs"}  # emptied by the first search

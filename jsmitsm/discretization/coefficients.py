@@ -72,12 +72,18 @@ def numbers(disc: Discretization, problem: Problem, taylor: Any = None, everywhe
 
 def conditions_of(disc: Discretization, problem: Problem) -> tuple[Any, Any, Any]:
     """The conditions' values (held, given, gamma; see Numbers) of another problem of the same form."""
-    groups = group_conditions(problem, with_corners(problem, disc.cloud), disc.rec.order, disc.traced.order)
+    cloud, whole = with_corners(problem, disc.cloud), disc.part is None
+    groups = group_conditions(problem, cloud, disc.rec.order, disc.traced.order, whole)
     other = replace(disc, groups=groups)
     held = _held_values(other)
     _, _, given = _own_numbers(other, held, None)
     _, gamma = _data_numbers(other, None)
     return _at(other, held), given, gamma
+
+
+def held_values(disc: Discretization) -> Any:
+    """The values that conditions hold, at their places (N, F), zero elsewhere."""
+    return _at(disc, _held_values(disc))
 
 
 def _held_values(disc: Discretization) -> list[dict[int, Any]]:

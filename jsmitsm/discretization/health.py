@@ -61,6 +61,19 @@ def _worst(row: Row) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(row.lebesgue).max(axis=1), np.asarray(row.defect)
 
 
+def parted(classes: list[Class], rows: list[Row]) -> tuple[list[Class], list[Row], list[Class]]:
+    """The healthy particles of some classes with their rows, and the classes of the weak ones."""
+    well, good, poor = [], [], []
+    for cls, row in zip(classes, rows, strict=True):
+        weak = _score(row) > LEBESGUE
+        if weak.any():
+            poor.append(_some(cls, weak))
+        if not weak.all():
+            well.append(_some(cls, ~weak) if weak.any() else cls)
+            good.append(_take(row, ~weak) if weak.any() else row)
+    return well, good, poor
+
+
 def repaired(
     disc: Discretization, nums: Numbers, classes: list[Class], rows: list[Row]
 ) -> tuple[list[Class], list[Row], Health]:
@@ -103,9 +116,14 @@ def _sizes(disc: Discretization, pieces: dict[Any, list[tuple[Class, Row, np.nda
     }
     if disc.part is None:
         return mine
-    names = {key: (key[0].n_own, key[0].lost, key[1]) for key in mine}
+    names = {key: kind_of(*key) for key in mine}
     largest = disc.part.largest({names[key]: size for key, size in mine.items()})
     return {key: largest[name] for key, name in names.items()}
+
+
+def kind_of(scheme: Any, wide: bool) -> tuple[int, int, bool]:
+    """What tells the kinds of classes apart whose largest stencils a repair goes by."""
+    return scheme.n_own, scheme.lost, wide
 
 
 def _parted(

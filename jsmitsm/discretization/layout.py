@@ -250,14 +250,16 @@ def sorted_classes(disc: Discretization, ids: np.ndarray, stencils: Stencils) ->
         counts = np.max(np.where(near[ids] >= 0, np.arange(near.shape[1]), 0), axis=1, initial=0) + 1
         narrow = _most_need(counts, disc.part)
         wide = counts > 1.25 * narrow
-        widest = int(counts[~wide].max(initial=1)), near.shape[1]
+        widest = [int(counts[~wide].max(initial=1)), int(near.shape[1])]
+        if disc.part is not None:
+            widest = list(disc.part.largest(dict(enumerate(widest))).values())
         used = [_width_at_hand(disc.scheme, rounded_width(width)) for width in widest]
         near = np.pad(near, ((0, 0), (0, max(0, max(used) - near.shape[1]))), constant_values=-1)
     classes = []
     for k, width in enumerate(used):
         some = ids[wide == k]
         if len(some):
-            classes += split(disc, Class(some, near[some][:, :width], disc.scheme, bool(k)))
+            classes += split(disc, Class(some, near[some, :width], disc.scheme, bool(k)))
     return classes
 
 

@@ -16,6 +16,15 @@ from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.runtime.whole_program import in_one_program
 
 
+def predictions(disc: Discretization, classes: list[Class], rows: list[Row]) -> tuple[Any, np.ndarray, np.ndarray]:
+    """The global matrix of some rows without its diagonal of ones, as coordinates; not for traced neighbours."""
+    places = [_places(disc, cls) for cls in classes]
+    if not places:
+        return np.zeros(0), np.zeros(0, int), np.zeros(0, int)
+    found = _entries([row.weights for row in rows], [p.kept for p in places], np.zeros(0))
+    return found, np.concatenate([p.at for p in places]), np.concatenate([p.to for p in places])
+
+
 def matrix(disc: Discretization, classes: list[Class], rows: list[Row]) -> tuple[Any, Any, Any]:
     """The global matrix as coordinates: own u_i - sum_g weights u_g over the unknowns."""
     if is_traced([cls.neighbours for cls in classes]):

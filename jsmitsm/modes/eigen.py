@@ -107,12 +107,12 @@ def eigen(
     """
     start = time.perf_counter()
     check(problem, cloud, "S", order, None, stencils, throw=throw, depth=depth)
-    _check(problem, count, near, method)
+    check_question(problem, count, near, method)
     weights, massed = masses(problem, cloud, mass)
     of_regions(problem, cloud)
     pencil = assembled(problem, cloud, order=order, mass=tuple(massed), stencils=stencils, depth=depth)
     disc = pencil.layout.disc
-    _refuse_data(disc, pencil)
+    refuse_data(disc, pencil)
     fields = problem.fields
     local = time.perf_counter()
     pattern, stiff, inert = reduced(pencil, problem, weights)
@@ -172,7 +172,7 @@ def _finished(question: Question, values: Any, right: Any, good: Any, found: Any
     return Modes(values, u, disc.cloud, good, stats, question, found)
 
 
-def _check(problem: Problem, count: Any, near: Any, method: Any) -> None:
+def check_question(problem: Problem, count: Any, near: Any, method: Any) -> None:
     """Arguments that can be judged before any work."""
     refuse_extras(problem)
     if method != "S":
@@ -194,7 +194,7 @@ def _finite(value: Any) -> bool:
         return False
 
 
-def _refuse_data(disc: Discretization, pencil: Pencil) -> None:
+def refuse_data(disc: Discretization, pencil: Pencil) -> None:
     """Values of conditions and sources, which an eigenvalue problem has none of."""
     for one, _ in operators(pencil):
         source = one.traced.coefficients(one.cloud.points, 0, params=one.problem.params)[1]

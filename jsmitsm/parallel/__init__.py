@@ -7,12 +7,17 @@ Imports show and what stands before it.
 
 from jsmitsm.parallel.distributed import ParallelCloud, read
 from jsmitsm.parallel.estimate import error_estimate
+from jsmitsm.parallel.factorization import ParallelFactorization, factorize
 from jsmitsm.parallel.files import save
+from jsmitsm.parallel.filling import cloud_from
 from jsmitsm.parallel.gradient import value_and_grad
+from jsmitsm.parallel.pencil.evolution import ParallelEvolution, evolve
+from jsmitsm.parallel.pencil.modes import ParallelModes, eigen
 from jsmitsm.parallel.solution import ParallelSolution, evaluate, norm
 from jsmitsm.parallel.solving import solve
 
 __all__ = [
-    "ParallelCloud", "ParallelSolution", "error_estimate", "evaluate", "norm", "read", "save", "solve",
+    "ParallelCloud", "ParallelEvolution", "ParallelFactorization", "ParallelModes", "ParallelSolution",
+    "cloud_from", "eigen", "error_estimate", "evaluate", "evolve", "factorize", "norm", "read", "save", "solve",
     "value_and_grad",
 ]  # fmt: skip

@@ -23,8 +23,9 @@ _HALVINGS = 60
 class Slab:
     """The particles that one process holds of a cloud of ``count``.
 
-    number (n,): in the whole cloud; points, normals (n, D), NaN in the interior; group (n,): the number of the name in
-    ``names``; place (n,): among the particles of that group, in the order of the whole cloud.
+    number (n,): in the whole cloud; points (n, D); normals (n, D), NaN in the interior, or (n, 0) for none;
+    group (n,): the number of the name in ``names``; place (n,): among the particles of that group, in the order of the
+    whole cloud.
     """
 
     names: tuple[str, ...]
@@ -134,7 +135,7 @@ def read(
             slab = _mapped(us, points, groups, normals, names)
         else:
             slab = slab_of(us, from_mesh(os.fspath(points), tags))
-    return ParallelCloud(_placed(us, slab))
+    return ParallelCloud(placed(us, slab))
 
 
 def _mapped(us: Team, points: Any, groups: Any, normals: Any, names: Any) -> Slab:
@@ -153,7 +154,7 @@ def _mapped(us: Team, points: Any, groups: Any, normals: Any, names: Any) -> Sla
     if len(stray):
         raise ValueError(f"groups: particle {some.start + stray[0]} has {codes[stray[0]]}, which names does not name")
     own = np.array(mapped[some], float)
-    given = np.full(own.shape, np.nan) if normals is None else _part_of(normals, "normals", mapped.shape, some)
+    given = np.zeros((len(own), 0)) if normals is None else _part_of(normals, "normals", mapped.shape, some)
     number = np.arange(some.start, some.stop)
     return Slab(tuple(names), len(mapped), number, own, np.array(given, float), which, np.zeros(len(own), int),
                 normals is not None)  # fmt: skip
@@ -172,7 +173,7 @@ def _own_slab(us: Team, count: int) -> slice:
     return slice(us.rank * count // us.size, (us.rank + 1) * count // us.size)
 
 
-def _placed(us: Team, slab: Slab) -> Slab:
+def placed(us: Team, slab: Slab) -> Slab:
     """With the place of every particle in its group."""
     counts = np.stack(us.gather(np.bincount(slab.group, minlength=len(slab.names))))
     before = counts[: us.rank].sum(axis=0)
@@ -197,7 +198,7 @@ def slab_of(us: Team, cloud: Any) -> Slab:
     for k, ids in enumerate(cloud.groups.values()):
         group[ids], place[ids] = k, np.arange(len(ids))
     points = np.asarray(cloud.points, float)
-    normals = np.full(points.shape, np.nan) if cloud.normals is None else np.asarray(cloud.normals, float)
+    normals = np.zeros((len(cloud), 0)) if cloud.normals is None else np.asarray(cloud.normals, float)
     number, sizes = np.arange(some.start, some.stop), tuple(map(len, cloud.groups.values()))
     return Slab(tuple(cloud.groups), len(cloud), number, points[some], normals[some], group[some], place[some],
                 cloud.normals is not None, sizes)  # fmt: skip

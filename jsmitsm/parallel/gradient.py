@@ -17,8 +17,9 @@ from jsmitsm.discretization.leave_one_out import matrix, right_side, with_held
 from jsmitsm.discretization.rows import all_rows
 from jsmitsm.equation.problem import Problem
 from jsmitsm.parallel.distributed import ParallelCloud
-from jsmitsm.parallel.local import Local, local_kernel, local_problem
-from jsmitsm.parallel.solving import numbered, solve
+from jsmitsm.parallel.local import Local
+from jsmitsm.parallel.shares import local_kernel, local_problem
+from jsmitsm.parallel.solving import solve
 from jsmitsm.runtime.errors import explaining
 
 WRT = ("params", "points")
@@ -72,16 +73,19 @@ def value_and_grad(
     halo, disc = local.halo, local.disc
     given = () if problem.params is None else (problem.params,)
     with us.phase():
+        if not disc.linear:
+            raise ValueError(
+                "problem: gradients of nonlinear problems are not made for several processes; use js.solve"
+            )
         x = sol._values[~disc.held]
         part = lambda u: jnp.asarray(objective(u, jnp.asarray(sol.points), *given))  # noqa: E731
         value, slope = jax.value_and_grad(part)(jnp.asarray(sol.u))
         free = ~disc.held[halo.ids]
         slope = np.asarray(slope).reshape(free.shape)[free]
     weights = sol.system.solve(slope, transpose=True)
-    own, _ = numbered(us, local)
     with us.phase():
         points = jnp.asarray(local.cloud.points)
-        lagrangian = _lagrangian(objective, problem, local, x, weights, own)
+        lagrangian = _lagrangian(objective, problem, local, x, weights, local.owned)
         which = 0 if wrt == "params" else 1
         found = jax.tree.map(np.asarray, jax.grad(lagrangian, argnums=which)(problem.params, points))
     total = float(us.total(float(value)))

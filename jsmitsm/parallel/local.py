@@ -6,34 +6,43 @@ neighbours have most, how large are stencils that a repair widens) the processes
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 from typing import Any
 
-import jax
 import numpy as np
 
+from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.cloud.neighbours import EVEN_SAMPLE, Stencils, is_even, kept_distances, nearest
-from jsmitsm.discretization.coefficients import Numbers, numbers
-from jsmitsm.discretization.layout import Class, discretize, sorted_classes, table
+from jsmitsm.discretization import health
+from jsmitsm.discretization.coefficients import Numbers, numbers, slot_series
+from jsmitsm.discretization.held_particles import with_held_expansions
+from jsmitsm.discretization.layout import Class, Discretization, discretize, sorted_classes, table
 from jsmitsm.discretization.operator_kind import information_travels
 from jsmitsm.discretization.resolution.digits import LOOKED_AT
-from jsmitsm.discretization.rows import all_coefficients
+from jsmitsm.discretization.rows import all_coefficients, all_rows
 from jsmitsm.discretization.supports import Part
-from jsmitsm.equation.bcs import Condition
 from jsmitsm.equation.conditions import refuse_counts
 from jsmitsm.equation.problem import Problem
 from jsmitsm.parallel.distributed import Slab
 from jsmitsm.parallel.halo import Halo, boxes_of
-from jsmitsm.parallel.team import Team
+from jsmitsm.parallel.shares import local_kernel, local_problem
+from jsmitsm.parallel.team import Team, give_back
 from jsmitsm.particle.kernels import Kernel
 from jsmitsm.particle.moments import Row
 from jsmitsm.solution.run import Run
 
 # The first halo reaches so many times the radius of this many nearest particles for every free coefficient of the fit.
 # What repairs look at is ten stencils at the most.
-FIRST, POOL = 2.2, 10
+FIRST, POOL = 1.6, 10
 # A halo that falls short is widened to this more than what was missed.
 MORE = 1.05
+# Particles whose rows are made at a time: enough to fill a program, few enough not to be seen beside the matrix.
+AT_ONCE = 4096
+
+# What is made of the rows of some particles: (discretisation of these alone, numbers, classes, rows) -> anything.
+Use = Callable[[Discretization, Numbers, list[Class], list[Row]], Any]
 
 
 @dataclass
@@ -46,6 +55,7 @@ class Settings:
     kernel: Kernel | None
     repair: bool
     formulation: str
+    sources: bool = False  # whether the weights of a source are wanted that is zero
 
 
 class Local:
@@ -55,7 +65,7 @@ class Local:
         self.team, self.settings, self.mine = team, settings, mine
         self.problem = problem
         self.boxes = boxes_of(team, mine)
-        self._settle(team.most(_first_reach(mine, settings.order)))
+        self._settle(team.most(first_reach(mine, settings.order)))
 
     def _settle(self, reach: float) -> None:
         """Discretise on a halo of this reach, or of a larger one where the stencils need it."""
@@ -73,10 +83,11 @@ class Local:
             self.part = Part(halo.own, even, self._spacing(), self._sample(), self.team.largest, self.team.total)
             cloud = halo.slab.cloud()
             kernel = s.kernel and local_kernel(s.kernel, halo.slab)
-            local = local_problem(self.problem, halo.slab)
+            local = self._localised(halo.slab, cloud)
             self.cloud = cloud
             self.disc = discretize(
-                local, cloud, s.method, s.order, kernel, None, None, sources=False, depth=s.depth, part=self.part
+                local, cloud, s.method, s.order, kernel, None, None, sources=s.sources, depth=s.depth,
+                part=self.part,
             )
         missing = self.team.most(self._stencils_miss())
         if missing > 0.0 and self._grows():
@@ -84,7 +95,21 @@ class Local:
         with self.team.phase(halo.slab.number):
             self._check_together()
             self.run = Run(self.disc, self.disc.problem, "auto", True, s.repair, "loo")
+            self.widest = self.team.largest(_widest(self.disc.classes))
+        self._number()
+        give_back()
         return 0.0
+
+    def _localised(self, slab: Slab, cloud: Cloud) -> Problem:
+        """The problem on the local particles."""
+        return local_problem(self.problem, slab)
+
+    def widen(self, missing: float) -> bool:
+        """Begin anew on a halo that reaches farther by what is missing; False where that is not needed."""
+        if missing <= 0.0 or not self._grows():
+            return False
+        self._settle(MORE * (self.halo.reach + missing))
+        return True
 
     def _grows(self) -> bool:
         return self.team.total(int(len(self.halo) < self.mine.count)) > 0
@@ -112,8 +137,9 @@ class Local:
     def _stencils_miss(self) -> float:
         """By how much the halo falls short of the stencils of own particles, and of those that tell jumps from them."""
         near, radius = np.asarray(self.disc.stencils.indices), self.disc.stencils.radius
-        ids = np.unique(near[self.halo.ids])
-        ids = ids[ids >= 0]
+        seen = np.zeros(len(near) + 1, bool)  # -1 stands for none
+        seen[near[self.halo.ids]] = True
+        ids = np.flatnonzero(seen[:-1])
         if radius is None:
             return -1.0
         return self.halo.short_by(np.broadcast_to(np.asarray(radius), len(near))[ids], ids)
@@ -140,10 +166,26 @@ class Local:
                 'coefficients differ; use method="S"'
             )
 
+    # -- unknowns
+
+    def _number(self) -> None:
+        """Which of the local unknowns are the process's own, and the number of each among those of all processes."""
+        unknown = self.disc.unknowns
+        free = unknown >= 0
+        own = free & self.halo.own[:, None]
+        self.count = int(own.sum())
+        counts = self.team.gather(self.count)
+        self.first, self.size = sum(counts[: self.team.rank]), sum(counts)
+        number = np.full(unknown.shape, -1)
+        number[own] = self.first + np.arange(self.count)
+        number = self.halo.spread(number)
+        self.owned, self.place = np.zeros(int(free.sum()), bool), np.zeros(int(free.sum()), int)
+        self.owned[unknown[free]], self.place[unknown[free]] = own[free], number[free]
+
     # -- rows
 
-    def numbers(self, taylor: Any = None) -> Numbers:
-        nums = numbers(self.disc, self.disc.problem, taylor)
+    def numbers(self, disc: Discretization, taylor: Any = None) -> Numbers:
+        nums = numbers(disc, disc.problem, taylor)
         if nums.degenerate is not None:
             raise ValueError(
                 "pde: its highest derivatives lose their weight at some particles, and degenerate equations are not "
@@ -151,23 +193,84 @@ class Local:
             )
         return nums
 
-    def rows(self, taylor: Any = None) -> tuple[Numbers, list[Class], list[Row]]:
-        """The numbers and the rows of the own particles; on a wider halo where a repair looked beyond the first."""
+    def made(self, use: Use, start: Callable[[], Any] | None = None) -> list[Any]:
+        """``use`` of the rows of some own particles after others; on a wider halo where a repair looked beyond it.
+
+        start: expansions (n, F, K) on the present halo, about which a nonlinear problem is linearised.
+        """
         while True:
             first = self.run.health is None
+            taylor = None if start is None else start()
             with self.team.phase(self.halo.slab.number):
-                nums = self.numbers(taylor)
                 if first and self.settings.formulation == "auto":
-                    self._refuse_least_squares(nums)
-                classes, rows = self.run.local_rows(nums)
+                    self._refuse_least_squares(taylor)
+                found = [use(*piece) for piece in self._pieces(taylor)]
             missing = self.team.most(self._repairs_miss()) if first and self.settings.repair else 0.0
-            if missing <= 0.0 or not self._grows() or taylor is not None:
-                return nums, classes, rows
-            self._settle(MORE * (self.halo.reach + missing))
+            if not self.widen(missing):
+                return found
 
-    def _refuse_least_squares(self, nums: Numbers) -> None:
+    def only(self, classes: list[Class]) -> Discretization:
+        """The discretisation of the particles of some classes alone."""
+        own = np.zeros(len(self.halo), bool)
+        own[np.concatenate([np.zeros(0, int), *(cls.ids for cls in classes)])] = True
+        largest = lambda mine: {name: self.widest[name] for name in mine}  # noqa: E731
+        return replace(self.disc, classes=classes, part=replace(self.part, own=own, largest=largest))
+
+    def _pieces(self, taylor: Any) -> Iterator[tuple[Discretization, Numbers, list[Class], list[Row]]]:
+        """The own particles in pieces, the first time those with weak stencils repaired and last."""
+        run = self.run
+        repair = self.settings.repair and run.health is None and self.disc.scheme.method in ("S", "III")
+        poor: list[Class] = []
+        every: list[Class] = []
+        known = [] if run.health is None else [run.health.repaired]
+        told: list[health.Health] = []
+        for some in _gathered(self.disc.classes):
+            disc = self.only(some)
+            nums = self.numbers(disc, taylor)
+            classes, rows = all_rows(disc, nums)
+            if repair:
+                classes, rows, weak = health.parted(classes, rows)
+                poor += weak
+                if not classes:
+                    continue
+                disc = self.only(classes)
+            told.append(self._judged(health.examine(classes, rows), nums, rows))
+            every += classes
+            yield disc, nums, classes, rows
+            for cls in classes:  # what was kept for a next time is as large as the rows
+                cls.kept.clear()
+            del nums, classes, rows
+            give_back()
+        if poor:
+            disc = self.only(poor)
+            nums = self.numbers(disc, taylor)
+            classes, rows, found = health.repaired(disc, nums, *all_rows(disc, nums))
+            told.append(self._judged(found, nums, rows))
+            known.append(found.repaired)
+            every += classes
+            yield self.only(classes), nums, classes, rows
+        self.disc.classes = every
+        run.health = health.Health(
+            max((one.largest for one in told), default=1.0),
+            np.concatenate([np.zeros(0, int), *(one.weak for one in told)]),
+            np.concatenate([np.zeros(0, int), *known]),
+        )
+
+    def _judged(self, found: health.Health, nums: Numbers, rows: list[Row]) -> health.Health:
+        """What was found of a piece, unless its rows are not determined."""
+        self.run.health, before = found, self.run.health
+        self.run.judge(nums, rows)
+        self.run.health = before
+        return found
+
+    def _refuse_least_squares(self, taylor: Any) -> None:
         """Where information travels the least-squares form is right, of which the processes make none."""
-        if any(self.team.gather(information_travels(self.disc, nums))):
+        disc, ids = self.disc, self.disc.active
+        slots = None if taylor is None else slot_series(disc.rec, disc.traced.slots, taylor[ids], 0)
+        points = np.asarray(disc.cloud.points)[ids]
+        jac, _ = disc.traced.coefficients(points, 0, params=disc.problem.params, slots=slots)
+        leading: Any = SimpleNamespace(jac=jac)
+        if any(self.team.gather(information_travels(disc, leading))):
             raise ValueError(
                 'formulation: in this equation information travels (first order, or convection above diffusion), and '
                 'the least-squares form is not made for several processes; say formulation="loo" where diffusion '
@@ -180,7 +283,10 @@ class Local:
         ids = np.unique(np.concatenate([health.repaired, health.weak])).astype(int) if health else np.zeros(0, int)
         if not len(ids):
             return -1.0
-        widest = max(int((c.neighbours >= 0).sum(axis=1).max()) for c in self.disc.classes)
+        return self.pool_misses(ids, max(int((c.neighbours >= 0).sum(axis=1).max()) for c in self.disc.classes))
+
+    def pool_misses(self, ids: np.ndarray, widest: int) -> float:
+        """By how much the halo falls short of what a repair of stencils of this size looks at."""
         count = POOL * widest
         points = self.halo.slab.points
         if len(points) < min(count, self.mine.count):
@@ -199,8 +305,41 @@ class Local:
             found = np.asarray(all_coefficients(disc, nums, values))
         return self.halo.spread(found)
 
+    def expanded(self, values: np.ndarray, taylor: Any) -> np.ndarray:
+        """The expansions (n, F, K) that the rows linearised at ``taylor`` give to values (n, F), held ones' too."""
+        with self.team.phase(self.halo.slab.number):
+            found = np.asarray(all_coefficients(self.disc, self.numbers(self.disc, taylor), values))
+        found = self.halo.spread(found)
+        with self.team.phase(self.halo.slab.number):
+            found = np.asarray(with_held_expansions(self.disc, found))
+        return self.halo.spread(found)
 
-def _first_reach(mine: Slab, order: int) -> float:
+
+def _gathered(classes: list[Class]) -> list[list[Class]]:
+    """The classes cut, and small ones put together, so that each piece has about AT_ONCE particles."""
+    pieces: list[list[Class]] = []
+    left = 0
+    for cls in classes:
+        parts = max(1, round(len(cls.ids) / AT_ONCE))
+        for ids, near in zip(np.array_split(cls.ids, parts), np.array_split(cls.neighbours, parts)):
+            if len(ids) > left:
+                pieces.append([])
+                left = AT_ONCE
+            pieces[-1].append(replace(cls, ids=ids, neighbours=near) if parts > 1 else cls)
+            left -= len(ids)
+    return pieces
+
+
+def _widest(classes: list[Class]) -> dict[Any, int]:
+    """The largest stencil of every kind of class."""
+    out: dict[Any, int] = {}
+    for cls in classes:
+        kind = health.kind_of(cls.scheme, cls.wide)
+        out[kind] = max(int((cls.neighbours >= 0).sum(axis=1).max()), out.get(kind, 0))
+    return out
+
+
+def first_reach(mine: Slab, order: int) -> float:
     """The reach of a first halo: that of a stencil, and of those next to it."""
     size = {2: (order + 1) * 4, 3: (order + 1) ** 2 * 3}[mine.dim]
     points = mine.points
@@ -208,54 +347,3 @@ def _first_reach(mine: Slab, order: int) -> float:
     from scipy.spatial import cKDTree
 
     return FIRST * float(cKDTree(points).query(sample, k=min(size, len(points)))[0][:, -1].max())
-
-
-def local_kernel(kernel: Kernel, slab: Slab) -> Kernel:
-    """The kernel with the smoothing lengths of the local particles, where it has one for each."""
-    if np.ndim(kernel.h) == 0:
-        return kernel
-    if np.shape(kernel.h) != (slab.count,):
-        raise ValueError(f"kernel: h has shape {np.shape(kernel.h)}, expected a scalar or ({slab.count},)")
-    return kernel.at(slab.number)
-
-
-def local_problem(problem: Problem, slab: Slab) -> Problem:
-    """The problem with arrays over a group cut to its local particles, and held particles numbered here."""
-    bcs: dict[str, Any] = {}
-    for name, conditions in problem.bcs.items():
-        places, size = np.zeros(0, int), 0
-        if name in slab.names:
-            k = slab.names.index(name)
-            places, size = slab.place[slab.group == k], slab.sizes[k]
-        cut = [_local_condition(c, f"bcs[{name!r}]", places, size, slab, problem.fields) for c in conditions]
-        if any(c is not None for c in cut):
-            bcs[name] = [c for c in cut if c is not None]
-    return problem.replace(bcs=bcs)
-
-
-def _local_condition(
-    c: Condition, where: str, places: np.ndarray, size: int, slab: Slab, fields: int
-) -> Condition | None:
-    if c.kind in ("periodic", "interface"):
-        raise ValueError(f"{where}: js.{c.kind} is not made for several processes; use js.solve")
-    parts = dict(c.parts)
-    if c.kind == "fix":
-        wanted = np.array(c.indices)
-        if wanted.max() >= slab.count:
-            raise ValueError(f"{where}: particle {wanted.max()} does not exist; the cloud has {slab.count}")
-        at = np.minimum(np.searchsorted(slab.number, wanted), len(slab) - 1)
-        places, size = np.flatnonzero(slab.number[at] == wanted), len(wanted)
-        if not len(places):
-            return None
-        parts["indices"] = tuple(int(i) for i in at[places])
-    for name in c.numbers:
-        shape = np.shape(parts[name])
-        one_a_field = c.field is None and fields > 1 and shape == (fields,)
-        if shape and not one_a_field:
-            if shape[0] != size:
-                raise ValueError(f"{where}.{name}: shape {shape} for a group of {size} particles")
-            value = parts[name]
-            parts[name] = (value if isinstance(value, jax.Array) else np.asarray(value))[places]
-    out = Condition(c.kind, c.field, **parts)
-    out.numbers = c.numbers
-    return out

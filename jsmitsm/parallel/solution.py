@@ -29,14 +29,18 @@ class ParallelSolution:
         Their numbers in the whole cloud.
     local : Solution
         A solution on the own particles and those around them, with all that a ``js.Solution`` can do there.
+    iterations : int
+        Steps of Newton's method; 1 for a linear problem.
     stats : dict
         Seconds per phase, sizes, iterations, what was repaired (numbers in the whole cloud).
     """
 
-    def __init__(self, us: Team, local: Any, recipe: Recipe, values: Any, nums: Any, system: Any, slab: Any,
+    def __init__(self, us: Team, local: Any, recipe: Recipe, values: Any, system: Any,
                  seconds: dict[str, float]):  # fmt: skip
-        self._team, self._local, self._nums, self.system, self._slab = us, local, nums, system, slab
+        self._team, self._local, self.system = us, local, system
         self._values, self._recipe, self._taylor = values, recipe, None
+        self._linearised: Any = None  # the expansions at which a nonlinear problem was linearised last
+        self.iterations = 1
         halo, health = local.halo, local.run.health
         sent = sum(len(at) for at in halo.lent)
         name = lambda ids: np.concatenate(us.gather(halo.slab.number[np.asarray(ids, int)]))  # noqa: E731
@@ -69,7 +73,7 @@ class ParallelSolution:
     def local(self) -> Solution:
         """The solution on the own particles and those around them; asked for by all processes together."""
         if self._taylor is None:
-            self._taylor = self._local.coefficients(self._values)
+            self._taylor = self._local.coefficients(self._values, self._linearised)
         return Solution(
             self._values, self._local.cloud, self._recipe, None, True, 1, dict(self.stats), fitted=frozen(self._taylor)
         )

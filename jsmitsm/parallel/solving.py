@@ -8,16 +8,18 @@ from typing import Any
 import numpy as np
 
 from jsmitsm.cloud.cloud import Cloud
-from jsmitsm.discretization.leave_one_out import matrix, right_side, with_held
 from jsmitsm.equation.problem import Problem
 from jsmitsm.equation.regions.per_region import PerRegion
 from jsmitsm.equation.unknowns.extras import refuse_extras
+from jsmitsm.parallel.assembly import assembled, spread
 from jsmitsm.parallel.distributed import ParallelCloud, bisected, slab_of
 from jsmitsm.parallel.local import Local, Settings
+from jsmitsm.parallel.newton import newton
 from jsmitsm.parallel.solution import ParallelSolution
-from jsmitsm.parallel.system import SOLVERS, System
+from jsmitsm.parallel.system import SOLVERS
 from jsmitsm.parallel.team import Team, team
 from jsmitsm.particle.kernels import Kernel
+from jsmitsm.runtime.arrays import ValueOrFunction
 from jsmitsm.runtime.errors import did_you_mean, explaining
 from jsmitsm.solution.arguments import Depth, check
 from jsmitsm.solution.fit import Recipe
@@ -26,9 +28,9 @@ from jsmitsm.solution.fit import Recipe
 @explaining
 def solve(
     problem: Problem, cloud: Cloud | ParallelCloud, *, method: str = "S", order: int = 4, depth: Depth = "auto",
-    kernel: Kernel | None = None, formulation: str = "auto", solver: str = "auto",
+    kernel: Kernel | None = None, formulation: str = "auto", solver: str = "auto", u0: ValueOrFunction | None = None,
 ) -> ParallelSolution:  # fmt: skip
-    """Solve a linear ``problem`` on ``cloud``, whose particles the processes share.
+    """Solve ``problem`` on ``cloud``, whose particles the processes share.
 
     All processes call it together. The rows of the global system are those that ``js.solve`` makes, so that the
     solution agrees with that of one process to round-off times the condition of the system.
@@ -36,9 +38,9 @@ def solve(
     Parameters
     ----------
     problem : Problem
-        Linear, of one field or several. Not made for several processes: nonlinear problems, periodic pairs, several
-        regions, constraints, unknowns, point sources, complex values, fields that only derivatives determine,
-        degenerate equations. All are refused by name.
+        Of one field or several; a nonlinear one by Newton's damped steps. Not made for several processes: periodic
+        pairs, several regions, constraints, unknowns, point sources, complex values, fields that only derivatives
+        determine, degenerate equations. All are refused by name.
     cloud : Cloud or ParallelCloud
         A Cloud that every process made alike, or what ``jp.read`` returned. In 2D or 3D.
     method : {"S", "III"}
@@ -51,6 +53,8 @@ def solve(
     solver : {"auto", "hypre", "gamg", "mumps"}
         "auto": for one field with an operator of second order algebraic multigrid, hypre's and then PETSc's, and what
         these do not solve directly; for all else directly.
+    u0 : array_like or function, optional
+        Start of Newton's method: a function of x, or the values (N,) or (N, F) of the whole cloud.
 
     Returns
     -------
@@ -62,7 +66,8 @@ def solve(
     ValueError
         For bad input, and what is not made for several processes, on all of them.
     SolveError
-        For systems that no solver brings to a backward error of 1e-12, on all of them.
+        For systems that no solver brings to a backward error of 1e-12, and where Newton's damped steps do not
+        converge, on all of them.
 
     Examples
     --------
@@ -81,74 +86,51 @@ def solve(
     us = team()
     began = time.perf_counter()
     with us.phase():
-        _check(problem, cloud, method, order, depth, kernel, formulation, solver)
+        check_asked(problem, cloud, method, order, depth, kernel, formulation, solver)
         slab = slab_of(us, cloud)
     parted = bisected(us, slab)
+    del slab
     with us.phase():
         if not len(parted):
             raise ValueError(f"cloud: no particles for process {us.rank} of {us.size}; start fewer processes")
     repair = kernel is None
     local = Local(us, problem, parted, Settings(method, order, depth, kernel, repair, formulation))
-    return solved(us, local, problem, slab, solver, began)
+    return solved(us, local, solver, u0, began)
 
 
-def solved(us: Team, local: Local, problem: Problem, slab: Any, solver: str, began: float) -> ParallelSolution:
-    """Rows, global system, values."""
-    with us.phase():
-        if not local.disc.linear:
-            raise ValueError("problem: nonlinear ones are not made for several processes; use js.solve")
-    nums, classes, rows = local.rows()
-    made = time.perf_counter()
-    system, b = assembled(us, local, nums, classes, rows, solver)
+def solved(us: Team, local: Local, solver: str, u0: Any, began: float) -> ParallelSolution:
+    """Rows, global system, values; of a nonlinear problem the last ones of Newton's method."""
+    if not local.disc.linear:
+        found = newton(us, local, solver, u0)
+        seconds = {"local": found.seconds, "total": time.perf_counter() - began}
+        sol = ParallelSolution(us, local, recipe(local), found.values, found.system, seconds)
+        sol._linearised = found.taylor
+        sol.iterations, sol.stats["changes"] = found.steps, found.changes
+        return sol
+    system, b = assembled(us, local, solver)
     put = time.perf_counter()
     x = system.solve(b)
-    done = time.perf_counter()
-    values = spread(local, nums, x)
-    seconds = {"local": made - began, "assembly": put - made, "solve": done - put}
+    seconds = {"local": put - began, "solve": time.perf_counter() - put, "total": time.perf_counter() - began}
+    return ParallelSolution(us, local, recipe(local), spread(local, x), system, seconds)
+
+
+def recipe(local: Local) -> Recipe:
     rec = local.disc.rec
-    recipe = Recipe(
-        local.disc.scheme.method, rec.order, None, "loo", rec.fields, rec.depth, tuple(rec.orders)
-    )  # fmt: skip
-    return ParallelSolution(us, local, recipe, values, nums, system, slab, seconds)
+    return Recipe(local.disc.scheme.method, rec.order, None, "loo", rec.fields, rec.depth, tuple(rec.orders))
 
 
-def assembled(us: Team, local: Local, nums: Any, classes: Any, rows: Any, solver: str) -> tuple[System, np.ndarray]:
-    """The global system of the own rows, and the own part of its right-hand side."""
-    with us.phase():
-        own, number = numbered(us, local)
-        data, r, c = matrix(local.disc, classes, rows)
-        mine = own[r]
-        b = right_side(local.disc, nums, classes, rows)
-    rec = local.disc.rec
-    elliptic = rec.fields == 1 and set(rec.orders) == {2}
-    system = System(us, len(b), number[r[mine]], number[c[mine]], np.asarray(data)[mine], solver, elliptic)
-    return system, np.asarray(b)
+def check_asked(
+    problem: Any, cloud: Any, method: Any, order: Any, depth: Any, kernel: Any, form: Any, solver: Any
+) -> None:
+    """Refuse bad input, and in words what several processes do not make."""
+    refuse_others(problem, cloud, method, form, solver)
+    probe = cloud.slab.cloud() if isinstance(cloud, ParallelCloud) else cloud
+    given = None if kernel is None or np.ndim(kernel.h) else kernel
+    check(problem, probe, method, order, given, None, "auto", "auto", depth=depth)
 
 
-def numbered(us: Team, local: Local) -> tuple[np.ndarray, np.ndarray]:
-    """Which of the local unknowns are the process's own, and the number of each among those of all processes."""
-    unknown = local.disc.unknowns
-    free = unknown >= 0
-    own = free & local.halo.own[:, None]
-    first = sum(us.gather(int(own.sum()))[: us.rank])
-    number = np.full(unknown.shape, -1)
-    number[own] = first + np.arange(own.sum())
-    number = local.halo.spread(number)
-    flat = np.zeros(int(free.sum()), bool), np.zeros(int(free.sum()), int)
-    flat[0][unknown[free]], flat[1][unknown[free]] = own[free], number[free]
-    return flat
-
-
-def spread(local: Local, nums: Any, x: np.ndarray) -> np.ndarray:
-    """The values (n, F) of all local particles from the own unknowns."""
-    disc = local.disc
-    whole = np.zeros(disc.held.shape)
-    whole[~disc.held & local.halo.own[:, None]] = x
-    whole = local.halo.spread(whole)
-    return np.asarray(with_held(disc, nums, whole[~disc.held]))
-
-
-def _check(problem: Any, cloud: Any, method: Any, order: Any, depth: Any, kernel: Any, form: Any, solver: Any) -> None:
+def refuse_others(problem: Any, cloud: Any, method: Any, form: Any, solver: Any) -> None:
+    """Refuse by name what several processes do not make."""
     if not isinstance(problem, Problem):
         raise ValueError(f"problem: expected a js.Problem, got {type(problem).__name__}")
     if isinstance(problem.pde, PerRegion):
@@ -161,6 +143,3 @@ def _check(problem: Any, cloud: Any, method: Any, order: Any, depth: Any, kernel
                              f"processes{did_you_mean(value, known)}")  # fmt: skip
     if getattr(cloud, "dim", 2) == 1:
         raise ValueError("cloud: one in 1D has no need of several processes; use js.solve")
-    probe = cloud.slab.cloud() if isinstance(cloud, ParallelCloud) else cloud
-    given = None if kernel is None or np.ndim(kernel.h) else kernel
-    check(problem, probe, method, order, given, None, "auto", "auto", depth=depth)

@@ -6,11 +6,11 @@ The transpose is assembled: BoomerAMG's own transposed solve is wrong without a 
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from jsmitsm.parallel.team import Team, engine
+from jsmitsm.parallel.team import Team, engine, give_back
 from jsmitsm.runtime.errors import SolveError
 
 # Solvers by name. Hypre is tuned for second-order operators on scattered particles, see docs/parallel.md.
@@ -25,27 +25,60 @@ REDUCED, MOST_STEPS, CORRECTIONS = 1e-10, 200, 5
 BACKWARD_ERROR, ROUND_OFF = 1e-12, 2e-16
 
 
+class Block(NamedTuple):
+    """Some own rows: their numbers (m,) among the own, and their entries (m, size), columns numbered over all."""
+
+    rows: np.ndarray
+    entries: Any
+
+
+def distributed(team: Team, n: int, blocks: list[Block]) -> Any:
+    """The matrix of PETSc's that has the blocks' rows, n of them here; each block is let go once it stands there."""
+    petsc = engine("petsc4py.PETSc")
+    counts = team.gather(n)
+    first, size = sum(counts[: team.rank]), sum(counts)
+    index = petsc.IntType
+    if size > np.iinfo(index).max:
+        raise SolveError(f"{size} unknowns need a PETSc with 64-bit indices (libpetsc64-real-dev)")
+    here, away = np.zeros(n, index), np.zeros(n, index)
+    for rows, entries in blocks:
+        near = (entries.indices >= first) & (entries.indices < first + n)
+        upto = np.concatenate([[0], np.cumsum(near)])[entries.indptr]
+        here[rows] += np.diff(upto).astype(index)
+        away[rows] += (np.diff(entries.indptr) - np.diff(upto)).astype(index)
+    matrix = petsc.Mat().create(comm=team.comm)
+    matrix.setSizes(((n, size), (n, size)))
+    matrix.setType("aij")
+    matrix.setPreallocationNNZ((here, away))
+    while blocks:
+        rows, entries = blocks.pop()
+        places = (entries.indptr.astype(index), entries.indices.astype(index), entries.data)
+        matrix.setValuesIJV(*places, addv=True, rowmap=(first + rows).astype(index))
+        del rows, entries, places
+        give_back()
+    matrix.assemble()
+    return matrix
+
+
+def product(matrix: Any, x: np.ndarray) -> np.ndarray:
+    """The own part (n,) of A x, from that of x."""
+    vector, out = matrix.createVecRight(), matrix.createVecLeft()
+    vector.setArray(x)
+    matrix.mult(vector, out)
+    return out.getArray().copy()
+
+
 class System:
-    """The rows of all processes: entries at (rows, columns), rows and columns numbered over all.
+    """The rows of all processes, unknowns numbered over all.
 
     info: the solver, the iterations of the last solve (to its first guess, and in all), and its backward error.
     """
 
-    def __init__(self, team: Team, n: int, rows: Any, cols: Any, data: Any, solver: str, elliptic: bool):
-        from scipy import sparse
-
+    def __init__(self, team: Team, matrix: Any, solver: str, elliptic: bool):
         self.team, self.elliptic = team, elliptic
         self.petsc = engine("petsc4py.PETSc")
-        self.n = n
-        counts = team.gather(n)
-        self.first, self.size = sum(counts[: team.rank]), sum(counts)
-        own = sparse.csr_array((data, (rows - self.first, cols)), shape=(n, self.size))
-        own.sum_duplicates()
-        index = self.petsc.IntType
-        if self.size > np.iinfo(index).max:
-            raise SolveError(f"{self.size} unknowns need a PETSc with 64-bit indices (libpetsc64-real-dev)")
-        csr = own.indptr.astype(index), own.indices.astype(index), own.data
-        self.matrix = self.petsc.Mat().createAIJ(((n, self.size), (n, self.size)), csr=csr, comm=team.comm)
+        self.n, self.size = matrix.getLocalSize()[0], matrix.getSize()[0]
+        self.matrix = matrix
         self.turned: Any = None
         self.ways = ("hypre", "gamg", "mumps") if elliptic else ("mumps",)
         if solver != "auto":
@@ -71,6 +104,10 @@ class System:
             f"{' and '.join(self.ways)} left a backward error of {error:.1e} of the global system, which is singular "
             "or beyond this solver; is a condition missing, or the operator at a resonance? Try solver=\"mumps\""
         )
+
+    def times(self, x: np.ndarray) -> np.ndarray:
+        """The own part (n,) of A x."""
+        return product(self.matrix, x)
 
     def _refined(self, way: str, matrix: Any, b: np.ndarray, transpose: bool) -> tuple[np.ndarray, float, list[int]]:
         """The solution of one solver, its backward error, and the iterations of the first solve and each correction."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import sys
 import time
 import traceback
@@ -16,6 +17,8 @@ from jsmitsm.runtime.errors import SolveError, some
 
 # Seconds that the others leave the first process for the message.
 PATIENCE = 5.0
+# The option of glibc's mallopt, and the bytes from which on an array is large.
+_MMAP_THRESHOLD, _LARGE = -3, 1 << 18
 
 
 def engine(name: str) -> Any:
@@ -27,6 +30,18 @@ def engine(name: str) -> Any:
             f'{name} is needed for jsmitsm.parallel ({error}): install MPI and PETSc, then pip install "jsmitsm[mpi]"; '
             "see docs/parallel.md"
         ) from None
+
+
+def give_back() -> None:
+    """Memory that was let go, given back to the system: what comes next is of other sizes and would stand beside it."""
+    if sys.platform == "linux" and hasattr(ctypes.CDLL(None), "malloc_trim"):
+        ctypes.CDLL(None).malloc_trim(0)
+
+
+def _large_apart() -> None:
+    """Large arrays are to come from the system one by one, and go back to it at once, whatever was let go before."""
+    if sys.platform == "linux" and hasattr(ctypes.CDLL(None), "mallopt"):
+        ctypes.CDLL(None).mallopt(_MMAP_THRESHOLD, _LARGE)
 
 
 class Elsewhere(SolveError):
@@ -109,6 +124,7 @@ def team() -> Team:
     """The processes under mpiexec. From now on an error that leaves one of them ends them all, with its message."""
     mpi = engine("mpi4py.MPI")
     found = Team(mpi.COMM_WORLD)
+    _large_apart()
     if found.size > 1:
 
         def stop(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:

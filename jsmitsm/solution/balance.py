@@ -95,8 +95,8 @@ def spread(disc: Discretization, missed: Any) -> Any:
 
     Where all that is compared is held, values are met exactly, whatever the data.
     """
-    free = ~disc.held[:, _leading(disc)].all(axis=1)[disc.active]
-    if not free.any():
+    free = np.flatnonzero(~disc.held[disc.active][:, _leading(disc)].all(axis=1))
+    if not len(free):
         return 0.0
     xp = jnp if is_traced(missed) else np
     found = xp.median(missed[free]) * len(disc.cloud) ** (1.0 / disc.rec.dim)

@@ -239,10 +239,10 @@ def test_a_normal_and_the_time_are_known_by_their_names():
     runs = [js.evolve(js.Problem(COOLING.pde, {**COOLING.bcs, "right": c}), ROD, 1.0, (0.0, 0.1), steps=4)
             for c in (out, js.robin(1.0, 1.0, 0.0))]  # fmt: skip
     assert np.abs(runs[0].u[-1] - runs[1].u[-1]).max() < 1e-12
-    problem = js.Problem(lambda u, x, t, k: js.dt(u)(x) - k * js.laplacian(u)(x), everywhere(
-        ROD, js.dirichlet(lambda x, t: t)), params=2.0)  # fmt: skip
-    with pytest.raises(ValueError, match=r"calls it as f\(x, t, params\), with the time t"):
-        js.evolve(problem, ROD, 0.0, (0.0, 0.1), steps=4)
+    runs = [js.evolve(js.Problem(lambda u, x, t, k: js.dt(u)(x) - k * js.laplacian(u)(x),
+                                 everywhere(ROD, js.dirichlet(value)), params=2.0), ROD, 0.0, (0.0, 0.1), steps=4)
+            for value in (lambda x, t: t, lambda x, t, k: t)]  # fmt: skip
+    assert np.array_equal(runs[0].u, runs[1].u) and runs[0].u[-1, 0] == 0.1
 
 
 def test_a_wave_over_ten_periods():

@@ -1,5 +1,6 @@
 """What several processes find, against one: run under mpiexec by test_parallel, which reads what is printed last."""
 
+import importlib.util
 import json
 import sys
 import tempfile
@@ -15,6 +16,8 @@ from scipy import sparse  # noqa: E402
 
 import jsmitsm as js  # noqa: E402
 import jsmitsm.parallel as jp  # noqa: E402
+from jsmitsm.cloud import contour, filling, levelset  # noqa: E402
+from jsmitsm.cloud.packing.lattice import lattice_part  # noqa: E402
 from jsmitsm.discretization.leave_one_out import matrix  # noqa: E402
 
 COMM = MPI.COMM_WORLD
@@ -56,6 +59,27 @@ def system():
     sides = {name: js.dirichlet(0.0) for name in SIDES[:3]}
     sides["top"] = [js.dirichlet(1.0, field=0), js.neumann(0.5, field=1)]
     return js.Problem(pde, sides, fields=2), js.rectangle((0, 0), (1, 1), (14, 14), jitter=0.2)
+
+
+def quasilinear():
+    """A conductivity that depends on u, and a side that radiates."""
+    sides = {name: js.dirichlet(lambda x: x[0] * x[1]) for name in SIDES[:3]}
+    sides["top"] = js.condition(lambda u, x, n: n @ js.grad(u)(x) + u(x) ** 3 - 1.0)
+    pde = lambda u, x: js.divergence(lambda y: (1 + u(y) ** 2) * js.grad(u)(y))(x) + 1.0 + x[0]  # noqa: E731
+    return js.Problem(pde, sides), js.rectangle((0, 0), (1, 1), (14, 14), jitter=0.2)
+
+
+def heated(source, level):
+    sides = {name: js.dirichlet(lambda x: level * x[0]) for name in SIDES[:3]}
+    sides["top"] = js.robin(1.0, 1.0, level)
+    return js.Problem(lambda u, x: (1 + x[0]) * js.laplacian(u)(x) + source * jnp.sin(x[1]), sides)
+
+
+def warming():
+    """Heat with data that depend on time, and a start that contradicts them."""
+    sides = {name: js.dirichlet(lambda x, t: t * x[0]) for name in SIDES[:3]}
+    sides["top"] = js.robin(1.0, 1.0, lambda x, t: t)
+    return js.Problem(lambda u, x, t: js.dt(u)(x) - (1 + x[0]) * js.laplacian(u)(x) - x[1] * jnp.sin(t), sides)
 
 
 def of_rows(sol, one):
@@ -148,13 +172,17 @@ def main():
     _, moved = jp.value_and_grad(lambda u, x, k: (u**2).sum(), problem, cloud, wrt="points", **CHEAP)
     found["by points"] = _differences(problem, cloud, moved)
 
+    _more(found)
     none = {name: js.neumann(0.0) for name in SIDES}
     lap = lambda u, x: js.laplacian(u)(x)  # noqa: E731
     zero = {name: js.dirichlet(0.0) for name in SIDES}
     pair = {**{name: zero[name] for name in SIDES[2:]}, "left": js.periodic("left", "right")}
     found["refused"] = {
         "floating": refused(lambda: jp.solve(js.Problem(lap, none), cloud)),
-        "nonlinear": refused(lambda: jp.solve(js.Problem(lambda u, x: lap(u, x) - u(x) ** 2, zero), cloud)),
+        "nonlinear": refused(lambda: jp.factorize(js.Problem(lambda u, x: lap(u, x) - u(x) ** 2, zero), cloud)),
+        "in time": refused(lambda: jp.evolve(
+            js.Problem(lambda u, x, t: js.dt(u)(x) - lap(u, x) + u(x) ** 3, zero), cloud, 0.0, (0.0, 1.0), steps=2)),
+        "lattice": refused(lambda: jp.cloud_from(js.rectangle, (0, 0), (1, 1), (9, 9))),
         "II": refused(lambda: jp.solve(js.Problem(lap, zero), cloud, method="II")),
         "periodic": refused(lambda: jp.solve(js.Problem(lap, pair), cloud)),
         "first order": refused(lambda: jp.solve(
@@ -165,6 +193,45 @@ def main():
     if COMM.rank == 0:
         print(json.dumps(found))
     sys.stdout.flush()
+
+
+def _more(found):
+    """Newton's method, factors, heat, modes, and shapes filled in parts."""
+    problem, cloud = quasilinear()
+    one, sol = js.solve(problem, cloud, **CHEAP), jp.solve(problem, cloud, **CHEAP)
+    found["newton"], found["steps"] = off(sol, one), [sol.iterations, one.iterations]
+    places = np.array([[0.3, 0.4], [0.51, 0.77]])
+    found["newton anywhere"] = jp.norm(jp.evaluate(sol, places) - np.asarray(one(places)))
+    ready, alone = jp.factorize(heated(0.0, 0.0), cloud, **CHEAP), js.factorize(heated(0.0, 0.0), cloud, **CHEAP)
+    found["factorize"] = off(ready.solve(heated(2.0, 0.3)), alone.solve(heated(2.0, 0.3)))
+    found["kept"] = ready.solve(heated(1.0, 0.0)).system is ready.system
+    options = {"steps": 3, "order": 4, "save": 2}
+    one = js.evolve(warming(), cloud, lambda x: 1.0 + x[0], (0.0, 0.5), **options, progress=False)
+    run = jp.evolve(warming(), cloud, lambda x: 1.0 + x[0], (0.0, 0.5), **options)
+    found["heat"], found["times"] = jp.norm(run.u - np.asarray(one.u)[:, run.numbers]), run.t.tolist()
+    if importlib.util.find_spec("slepc4py"):
+        sides = {**{name: js.dirichlet(0.0) for name in SIDES[:3]}, "top": js.neumann(0.0)}
+        drum, mass = js.Problem(lambda u, x: -js.laplacian(u)(x) + x[0] * u(x), sides), lambda x: 1 + x[1]
+        one, several = (of.eigen(drum, cloud, 3, order=4, mass=mass) for of in (js, jp))
+        found["values of modes"] = float(np.abs(several.values / np.asarray(one.values) - 1.0).max())
+        found["modes"] = jp.norm(several.u - np.asarray(one.u)[several.numbers])
+    shape = js.sdf.difference(js.sdf.rectangle((0, 0), (1, 1.5)), js.sdf.circle((0.5, 0.5), 0.2))
+    slab = jp.cloud_from(js.from_sdf, shape, ((0, 0), (1, 1.5)), 0.05)
+    inside = COMM.gather(slab.points[slab.slab.group == 0])
+    if COMM.rank == 0:
+        mine, whole = (x[np.lexsort(x.T)] for x in (np.concatenate(inside), filled_by_one(shape)))
+        found["filled"] = float(np.abs(mine - whole).max()) if len(mine) == len(whole) else -1.0
+    problem = js.Problem(lambda u, x: js.laplacian(u)(x) + 3.0 * exact(x), {"boundary": js.dirichlet(exact)})
+    sol = jp.solve(problem, slab, **CHEAP)
+    found["on a shape"] = jp.norm(sol.u - np.asarray(jax.vmap(exact)(sol.points)))
+
+
+def filled_by_one(shape):
+    """The interior of the shape in ``_more`` as one process fills it."""
+    lo, hi = np.array([0.0, 0.0]), np.array([1.0, 1.5])
+    region = levelset.SdfRegion(shape, lo, hi)
+    boundary = levelset.checked(region, contour.contour(region, filling.spacing_function(0.05))).points
+    return lattice_part(region, 0.05, lo, hi, boundary, 0, 1, np.array([-np.inf, np.inf]))
 
 
 def _differences(problem, cloud, moved):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.cloud.quadrature import quadrature
@@ -25,6 +24,8 @@ def node_weights(cloud: Cloud, degree: int) -> np.ndarray:
         for name, ids in cloud.regions.items():
             out[ids] = node_weights(cloud.region(name), degree)
         return out
+    from scipy.spatial import cKDTree
+
     points, dim = np.asarray(cloud.points, float), cloud.dim
     while degree > 1 and _neighbours(dim, degree) > len(points):
         degree -= 1

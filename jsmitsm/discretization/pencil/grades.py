@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from jsmitsm.discretization.coefficients import Numbers
-from jsmitsm.discretization.health import DEFECT, LEBESGUE, balanced, wider
+from jsmitsm.discretization.health import DEFECT, LEBESGUE, balanced, kind_of, wider
 from jsmitsm.discretization.layout import Discretization, rounded_width
 from jsmitsm.discretization.pencil.local import Part, part_of, widened
 from jsmitsm.particle.moments import Row
@@ -58,8 +58,11 @@ class Grading:
         blocks = blocks[inner] if inner.any() else blocks
         size = np.linalg.norm(blocks, axis=(1, 2), keepdims=True)
         usual = np.median(blocks / np.where(size > 0, size, 1.0), axis=0)  # (F, E)
+        if disc.part is not None:  # only signs and sizes beside one another count
+            usual = disc.part.total(np.nan_to_num(usual) * len(blocks))
         self.of_field = _paired(np.abs(usual))
         self.usual, self.massed = usual[:, self.of_field], massed[self.of_field]
+        self.sizes = _sizes(disc, parts)
 
     def __call__(self, part: Part) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Grades (n,), Lebesgue constants, dominance and whether the sign is wrong."""
@@ -90,6 +93,18 @@ class Grading:
         ratio = np.linalg.eigvals(own[comparable] @ np.linalg.inv(usual[comparable]))
         wrong[comparable] = (ratio.real <= 0).any(axis=1)
         return dominance, wrong
+
+
+def _sizes(disc: Discretization, parts: list[Part]) -> dict[Any, int]:
+    """The largest stencils of every kind of class, and of its sources; in a part of a cloud those of the whole."""
+    found: dict[Any, int] = {}
+    for part in parts:
+        kind = kind_of(part.cls.scheme, part.cls.wide)
+        for name, near in (("near", part.cls.neighbours), ("far", part.far)):
+            if near is not None:
+                size = int((near >= 0).sum(axis=1).max())
+                found[kind, name] = max(size, found.get((kind, name), 0))
+    return found if disc.part is None else disc.part.largest(found)
 
 
 def _paired(size: np.ndarray) -> np.ndarray:
@@ -148,9 +163,8 @@ def _repaired(
 ) -> list[Part]:
     """Weak particles of one class with better stencils; those that no stencil mends follow their neighbours."""
     points = disc.images.searched(np.asarray(disc.cloud.points))
-    size = int((part.cls.neighbours >= 0).sum(axis=1).max())
     assert part.far is not None
-    far_size = int((part.far >= 0).sum(axis=1).max()) if part.far.shape[1] > 1 else 1
+    size, far_size = (grading.sizes[kind_of(part.cls.scheme, part.cls.wide), name] for name in ("near", "far"))
     most = min(len(points), round(2.2 * size)), min(len(points), round(2.2 * far_size))
     near, far = (widened(x, rounded_width(m, 16)) for x, m in zip((part.cls.neighbours, part.far), most))
     far = part.far if far_size == 1 else far

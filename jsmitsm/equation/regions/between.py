@@ -151,6 +151,11 @@ def between(problem: Problem, name: str, points: Any, normals: Any) -> Between:
         resistance = given["resistance"]
         if resistance is not None:
             resistance = component(problem, points, resistance, 0, 0, f"{where}.resistance")()
+            if not is_traced(resistance) and (np.asarray(resistance) < 0).any():
+                raise ValueError(
+                    f"{where}.resistance: {np.min(resistance):.6g} came, expected none below zero: the temperature "
+                    "falls along the flow of heat, u_a - u_b = -resistance flux_a; state other laws as a residual"
+                )
         return _rows(made, places, values("jump"), values("source"), resistance, len(slots))
 
     plain = given["resistance"] is None

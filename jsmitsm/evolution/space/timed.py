@@ -236,14 +236,15 @@ def condition_in_time(c: Condition, with_params: bool, where: str) -> Condition:
 
 def in_time(function: Callable[..., Any], with_params: bool, forms: Any, where: str, kind: str) -> Callable[..., Any]:
     """A user's function of t as one of the parameters (t, params)."""
-    fitting = [names for names, count in forms if _takes(function, count + with_params, names)]
-    tail = ", params" if with_params else ""
+    # Functions that leave out the params are known by the names of their arguments.
+    fitting = [(names, tail) for tail in sorted({with_params, False}, reverse=True) for names, count in forms
+               if _takes(function, count + tail, names, tail < with_params)]  # fmt: skip
     if not fitting:
         raise ValueError(
-            f"{where}: js.evolve calls it as f({forms[0][0]}{tail}), with the time t"
+            f"{where}: js.evolve calls it as f({forms[0][0]}{', params' if with_params else ''}), with the time t"
             + (", and params last" if with_params else "") + "; it takes other arguments"
         )  # fmt: skip
-    names = fitting[0]
+    names, with_params = fitting[0]
 
     def last(p: Any) -> tuple[Any, ...]:
         return ((p[0],) if names.endswith("t") else ()) + ((p[1],) if with_params else ())
@@ -261,11 +262,11 @@ def in_time(function: Callable[..., Any], with_params: bool, forms: Any, where: 
     return lambda x, p: function(x, *last(p))
 
 
-def _takes(function: Callable[..., Any], count: int, names: str) -> bool:
+def _takes(function: Callable[..., Any], count: int, names: str, named: bool) -> bool:
     """Whether a function takes so many arguments, those of these names.
 
     Numbers kept in defaults, as in lambda x, c=c: c * x[0], do not take the place of the time. An argument called t is
-    the time and one called n the normal, and so no other.
+    the time and one called n the normal, and so no other; named: and the time is called so.
     """
     try:
         signature = inspect.signature(function)
@@ -273,7 +274,7 @@ def _takes(function: Callable[..., Any], count: int, names: str) -> bool:
     except TypeError:
         return False
     except ValueError:  # a callable without a signature
-        return True
+        return not named
     meant = names.split(", ")
     given = list(signature.parameters.values())[:count]
     if names == "u, x, n" and given[2].name not in NORMAL:
@@ -284,6 +285,6 @@ def _takes(function: Callable[..., Any], count: int, names: str) -> bool:
             return False
         if one.name in NORMAL and role not in ("n", ""):
             return False
-        if role == "t" and one.default is not inspect.Parameter.empty and one.name not in TIMES:
+        if role == "t" and one.name not in TIMES and (named or one.default is not inspect.Parameter.empty):
             return False
     return True

@@ -60,14 +60,14 @@ def newton(run: Run, u0: Any) -> tuple[Any, Any, Any, Any]:
             (values, taylor), _, good, _ = _searched(record, here.numbers(), one.numbers())
         run.changes = record.changes
         steps, rate = record.steps, record.rate
-    _refuse_jumps(run, values, taylor)
+    refuse_jumps_at(run, values, taylor)
     if is_traced(one):
         for _ in range(_repeats(rate)):
             values, taylor = advance(run, taylor)
     return values, taylor, good, steps
 
 
-def _refuse_jumps(run: Run, values: Any, taylor: Any) -> None:
+def refuse_jumps_at(run: Run, values: Any, taylor: Any) -> None:
     """Refuse jumps that the operator differentiates where they depend on u, as it has come out."""
     for disc, _, ids in run.operators():
         found = disc.traced.branches
@@ -147,7 +147,7 @@ def _searched(record: Record, begin: Iterate, first: Iterate) -> Found:
         if near is not None and step is not None:
             best = min(best, _damped(record, near, step), key=lambda found: (not found.good, found.change))
     if not best.good:
-        _refuse_jumps(record.run, *best.at)
+        refuse_jumps_at(record.run, *best.at)
         record.run.fail(
             f"Newton's method did not converge: {', '.join(ways)} were tried, {record.solves} linear solves, and the "
             f"next one would still change u by {best.change:.1e} of its size; start nearer (u0), approach the "
