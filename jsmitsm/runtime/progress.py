@@ -29,6 +29,7 @@ DELAY, TICK, PAUSE = 1.5, 0.5, 0.1
 # A stage that has lasted so many seconds tells how many are left.
 LASTING = 2.0
 COMPILING = "compiling (first call)"
+_COMPILERS = ("jax/_src/compiler.py", "jax/_src/interpreters/mlir.py")
 # The parts of a call in their order: a word in the name of each stage, and its share of the time, about.
 Parts = tuple[tuple[str, float], ...]
 SOLVE: Parts = (("local fits", 2.0), ("unknowns", 1.0))
@@ -62,12 +63,26 @@ class _Bar:
         self._bar = tqdm(total=1.0 if parts else total, desc=what, delay=DELAY, mininterval=PAUSE, miniters=0,
                          leave=False, bar_format=form, smoothing=0.0 if parts else 0.3)  # fmt: skip
         self._lock, self._done = threading.Lock(), threading.Event()
+        self._said, self._noted, self._caller = "", "", threading.get_ident()
         self._clock = threading.Thread(target=self._tick, name=f"clock of {what}", daemon=True)
         self._clock.start()
 
     def _tick(self) -> None:
         while not self._done.wait(TICK):
-            self.update(0)
+            self._compiles(in_compiler(self._caller))
+
+    def _compiles(self, busy: bool) -> None:
+        """Tell that a program is compiled, for as long as one is."""
+        with self._lock:
+            if self.total:
+                self._bar.set_postfix_str(COMPILING if busy else self._noted, refresh=False)
+            else:
+                self._describe(COMPILING if busy and COMPILING not in self._said else "")
+            self._bar.update(0)
+
+    def _describe(self, more: str = "") -> None:
+        words = ", ".join(filter(None, (self.what, self._said, more)))
+        self._bar.set_description_str(words, refresh=False)
 
     def update(self, n: int = 1) -> None:
         with self._lock:
@@ -76,11 +91,13 @@ class _Bar:
     def note(self, text: str) -> None:
         """A few words or numbers at the end of the bar."""
         with self._lock:
+            self._noted = text
             self._bar.set_postfix_str(text, refresh=False)
 
     def say(self, text: str) -> None:
         with self._lock:
-            self._bar.set_description_str(f"{self.what}, {text}" if text else self.what, refresh=False)
+            self._said = text
+            self._describe()
             self._bar.update(0)
 
     def reach(self, part: float) -> None:
@@ -206,6 +223,16 @@ def first_call() -> Iterator[None]:
         yield
     finally:
         say("")
+
+
+def in_compiler(thread: int) -> bool:
+    """Whether a thread is in JAX's compiler now, or writes down a program for it, whoever called for that."""
+    frame = sys._current_frames().get(thread)
+    while frame is not None:
+        if frame.f_code.co_filename.replace("\\", "/").endswith(_COMPILERS):
+            return True
+        frame = frame.f_back
+    return False
 
 
 def watched() -> bool:

@@ -209,6 +209,23 @@ def test_long_calls_tell_their_rest(monkeypatch):
     assert whole["error estimate"] == sorted(whole["error estimate"]) and whole["error estimate"][-1] == 1.0
 
 
+def test_whatever_compiles_is_seen(monkeypatch):
+    """The clock looks whether the caller's thread is in JAX's compiler: a program of the user's own is told too."""
+    seen, here, done = [], threading.get_ident(), threading.Event()
+
+    def clock():
+        while not done.wait(1e-3):
+            seen.append(progress.in_compiler(here))
+
+    assert not progress.in_compiler(here)
+    ticking = threading.Thread(target=clock)
+    ticking.start()
+    jax.jit(lambda x: sum(jax.numpy.sin(k * x) for k in range(60)))(1.0)
+    done.set()
+    ticking.join()
+    assert any(seen)
+
+
 def test_compiling_and_what_is_left_are_told(monkeypatch):
     """A stage that lasts tells the rest by what is done; a program's first run tells that it is compiled."""
     seen = watch(monkeypatch)
