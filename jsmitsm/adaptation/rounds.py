@@ -263,9 +263,9 @@ class Rounds:
             finer, _ = next_spacing(parted, power, float(apart.max()) / found.scale / _GAP, self.tol, most)
             made_h = np.where(finer < h, np.minimum(made_h, finer), made_h)
         field = SpacingField(points, made_h, spacing.largest)
-        if self._coarsened_too_much(spacing):
-            assert self.best is not None
-            field = self.best[2].joined(points, made_h)
+        better = self._better(spacing)
+        if better is not None:
+            field = better.joined(points, made_h)
         for _ in range(8):
             try:
                 following = self._cloud(field)
@@ -288,13 +288,13 @@ class Rounds:
         return field, following
 
 
-    def _coarsened_too_much(self, spacing: SpacingField) -> bool:
-        """Whether a round before this one did better; then no spacing grows over that of the best of them."""
+    def _better(self, spacing: SpacingField) -> SpacingField | None:
+        """The spacing of a round before that did better than the last one, over which no other may grow then."""
         order, error = self.rows[-1][1:3]
         if self.best is not None and self.best[0] == order and error > self.best[1]:
-            return True
+            return self.best[2]
         self.best = (order, error, spacing) if error < ROUGH else None
-        return False
+        return None
 
 
 def spent(history: dict[str, np.ndarray], tol: float) -> float:

@@ -50,6 +50,11 @@ class Numbers:
     gamma: Any
     degenerate: Degenerate | None = None  # what was found where the equation degenerates
 
+    @property
+    def of_matrix(self) -> list[Any]:
+        """What the rows are made of; the rest stands on the right."""
+        return [self.jac, self.own, self.data]
+
 
 def numbers(disc: Discretization, problem: Problem, taylor: Any = None, everywhere: bool = False) -> Numbers:
     """Evaluate the operator's Taylor coefficients, the source and the conditions.

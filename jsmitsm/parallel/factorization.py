@@ -10,7 +10,6 @@ import numpy as np
 
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.cloud.neighbours import Stencils
-from jsmitsm.discretization.coefficients import Numbers
 from jsmitsm.discretization.layout import Discretization, discretize, table
 from jsmitsm.discretization.leave_one_out import right_side
 from jsmitsm.equation.problem import Problem
@@ -24,7 +23,7 @@ from jsmitsm.parallel.team import team
 from jsmitsm.particle.kernels import Kernel
 from jsmitsm.runtime.errors import explaining
 from jsmitsm.solution.arguments import Depth
-from jsmitsm.solution.kept_matrix import refuse_other
+from jsmitsm.solution.kept_matrix import refuse_other, same_matrix
 
 
 class ParallelFactorization:
@@ -81,7 +80,7 @@ class ParallelFactorization:
             same = True
             for some, known, classes, rows in self._pieces:
                 nums = local.numbers(replace(local.disc, classes=classes, part=some.part))
-                same = same and _same(nums, known)
+                same = same and same_matrix(nums, known)
                 if same:
                     right[_places(local, some)] = np.asarray(right_side(some, nums, classes, rows))
         if not all(us.gather(same)):
@@ -99,12 +98,6 @@ def _places(local: Local, some: Discretization) -> np.ndarray:
     """Where the rows of some particles stand among the own."""
     unknowns = some.unknowns[some.active].reshape(-1)
     return local.place[unknowns[unknowns >= 0]] - local.first
-
-
-def _same(new: Numbers, old: Numbers) -> bool:
-    """Whether the rows that one set of numbers made are those of the other."""
-    return all(np.array_equal(np.asarray(getattr(new, name)), np.asarray(getattr(old, name)))
-               for name in ("jac", "own", "data"))  # fmt: skip
 
 
 @explaining

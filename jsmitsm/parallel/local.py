@@ -347,3 +347,19 @@ def first_reach(mine: Slab, order: int) -> float:
     from scipy.spatial import cKDTree
 
     return FIRST * float(cKDTree(points).query(sample, k=min(size, len(points)))[0][:, -1].max())
+
+
+class OfOwn:
+    """What every process has its own particles' part of."""
+
+    _local: Local
+
+    @property
+    def points(self) -> np.ndarray:
+        """The own particles (n, D)."""
+        return self._local.mine.points
+
+    @property
+    def numbers(self) -> np.ndarray:
+        """The numbers (n,) of the own particles in the whole cloud."""
+        return self._local.mine.number

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from jsmitsm.parallel.halo import from_box
+from jsmitsm.parallel.local import OfOwn
 from jsmitsm.parallel.team import Team, team
 from jsmitsm.runtime.arrays import ArrayLike
 from jsmitsm.runtime.errors import explaining
@@ -16,7 +17,7 @@ from jsmitsm.solution.fit import Recipe
 from jsmitsm.solution.solution import Solution
 
 
-class ParallelSolution:
+class ParallelSolution(OfOwn):
     """A solution of which every process has a part.
 
     Attributes
@@ -38,7 +39,8 @@ class ParallelSolution:
     def __init__(self, us: Team, local: Any, recipe: Recipe, values: Any, system: Any,
                  seconds: dict[str, float]):  # fmt: skip
         self._team, self._local, self.system = us, local, system
-        self._values, self._recipe, self._taylor = values, recipe, None
+        self._values, self._recipe = values, recipe
+        self._taylor: Any = None
         self._linearised: Any = None  # the expansions at which a nonlinear problem was linearised last
         self.iterations = 1
         halo, health = local.halo, local.run.health
@@ -58,16 +60,6 @@ class ParallelSolution:
         """Values (n,) or (n, F) of the own particles."""
         own = self._values[self._local.halo.ids]
         return own[:, 0] if self._recipe.fields == 1 else own
-
-    @property
-    def points(self) -> np.ndarray:
-        """The own particles (n, D)."""
-        return self._local.mine.points
-
-    @property
-    def numbers(self) -> np.ndarray:
-        """The numbers (n,) of the own particles in the whole cloud."""
-        return self._local.mine.number
 
     @property
     def local(self) -> Solution:

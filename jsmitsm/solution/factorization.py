@@ -22,7 +22,7 @@ from jsmitsm.runtime.progress import SOLVE, bar
 from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.solution.arguments import Depth, Formulation, Method, check, discretized, of_regions
 from jsmitsm.solution.fit import Fit, Recipe
-from jsmitsm.solution.kept_matrix import KeptMatrix, refuse_other
+from jsmitsm.solution.kept_matrix import KeptMatrix, refuse_other, same_matrix
 from jsmitsm.solution.regions.factorization import RegionsFactorization
 from jsmitsm.solution.run import Run
 from jsmitsm.solution.solution import Solution
@@ -95,8 +95,7 @@ class Factorization(KeptMatrix):
             refuse_other()
         problem = disc.problem
         nums = numbers(disc, problem)
-        same = _same(nums.jac, self._nums.jac) and _same(nums.own, self._nums.own) and _same(nums.data, self._nums.data)
-        if not same or disc.scheme.method in ("I", "II"):
+        if not same_matrix(nums, self._nums) or disc.scheme.method in ("I", "II"):
             made = Factorization(disc, problem, *self._options)
             return made._finish(problem, made._nums, made._right)
         return self._finish(problem, nums, self._right_side(nums))
@@ -128,10 +127,6 @@ class Factorization(KeptMatrix):
 
     def __repr__(self) -> str:
         return f"Factorization({int((~self._disc.held).sum())} unknowns, method={self._disc.scheme.method!r})"
-
-
-def _same(x: Any, y: Any) -> bool:
-    return np.shape(x) == np.shape(y) and not is_traced(x, y) and bool(np.array_equal(np.asarray(x), np.asarray(y)))
 
 
 @explaining

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any, NoReturn
 
+import numpy as np
+
 from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.solution.run import Run
 
@@ -26,6 +28,12 @@ class KeptMatrix:
         raise TypeError(
             "a Factorization is not pickled, nor copied: keep the problem and the cloud, and call js.factorize again"
         )
+
+
+def same_matrix(new: Any, old: Any) -> bool:
+    """Whether the matrix of some numbers, of one region or of several, is that of others; not known of traced ones."""
+    pairs = list(zip(new.of_matrix, old.of_matrix, strict=True))
+    return not is_traced(pairs) and all(np.array_equal(np.asarray(a), np.asarray(b)) for a, b in pairs)
 
 
 def refuse_other() -> NoReturn:

@@ -62,12 +62,12 @@ def test_a_lid_drives_the_flow_from_zero():
 
 
 def test_where_deep_expansions_do_not_settle_there_is_the_solution_without(monkeypatch):
-    damped = newton._damped
+    damped = newton.damped
 
     def never_deep(record, here, target):
         return damped(record, here, target)._replace(good=not record.run.disc.rec.depth)
 
-    monkeypatch.setattr(newton, "_damped", never_deep)
+    monkeypatch.setattr(newton, "damped", never_deep)
     ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(0.0)}
     problem = js.Problem(lambda u, x: js.laplacian(u)(x) + jnp.exp(u(x)), ends)
     sol, flat = (js.solve(problem, js.interval(0.0, 1.0, 21), depth=depth) for depth in ("auto", 0))

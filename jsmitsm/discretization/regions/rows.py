@@ -36,6 +36,11 @@ class RegionNumbers:
     between: dict[str, tuple[Any, Any]]
     held: Any
 
+    @property
+    def of_matrix(self) -> list[Any]:
+        """What the rows are made of; the rest stands on the right."""
+        return [x for own in self.parts for x in own.of_matrix] + [coef for coef, _ in self.between.values()]
+
     degenerate = None  # told region by region
 
 

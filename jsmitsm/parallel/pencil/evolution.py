@@ -17,7 +17,7 @@ from jsmitsm.evolution.steps import dense_output
 from jsmitsm.evolution.steps.stepping import Stepper
 from jsmitsm.evolution.steps.tableaux import EULER, KENCARP4
 from jsmitsm.parallel.distributed import ParallelCloud, Slab, bisected, slab_of
-from jsmitsm.parallel.local import Local, Settings
+from jsmitsm.parallel.local import Local, OfOwn, Settings
 from jsmitsm.parallel.pencil.assemble import own_rows, pencil_of_part
 from jsmitsm.parallel.shares import local_problem
 from jsmitsm.parallel.solving import refuse_others
@@ -32,7 +32,7 @@ SCHEMES = {"auto": KENCARP4, "esdirk": KENCARP4, "euler": EULER}
 ROUND_OFF, SMALL = 1e-13, 1e-7
 
 
-class ParallelEvolution:
+class ParallelEvolution(OfOwn):
     """A run of which every process has its own particles' part.
 
     Attributes
@@ -52,16 +52,6 @@ class ParallelEvolution:
     def __init__(self, t: np.ndarray, u: np.ndarray, local: Local, flags: list[str], stats: dict[str, Any]):
         self.t, self.u, self.flags, self.stats = t, u, flags, stats
         self._local = local
-
-    @property
-    def points(self) -> np.ndarray:
-        """The own particles (n, D)."""
-        return self._local.mine.points
-
-    @property
-    def numbers(self) -> np.ndarray:
-        """The numbers (n,) of the own particles in the whole cloud."""
-        return self._local.mine.number
 
     def __repr__(self) -> str:
         return f"ParallelEvolution({len(self.t)} times, {self.u.shape[1]} of {self._local.mine.count} particles here)"

@@ -13,7 +13,7 @@ from jsmitsm.equation.problem import Problem
 from jsmitsm.modes.eigen import check_question, refuse_data
 from jsmitsm.modes.mass import is_operator, masses, weighted
 from jsmitsm.parallel.distributed import ParallelCloud, bisected, slab_of
-from jsmitsm.parallel.local import Local, Settings
+from jsmitsm.parallel.local import Local, OfOwn, Settings
 from jsmitsm.parallel.pencil.assemble import own_rows, pencil_of_part
 from jsmitsm.parallel.solving import check_asked
 from jsmitsm.parallel.system import product
@@ -26,7 +26,7 @@ from jsmitsm.solution.arguments import Depth
 MORE, SETTLED, MOST = 6, 1e-13, 500
 
 
-class ParallelModes:
+class ParallelModes(OfOwn):
     """Modes of which every process has its own particles' part.
 
     Attributes
@@ -51,16 +51,6 @@ class ParallelModes:
     def u(self) -> np.ndarray:
         """The modes (n, k) or (n, k, F) at the own particles."""
         return self._u[..., 0] if self._u.shape[-1] == 1 else self._u
-
-    @property
-    def points(self) -> np.ndarray:
-        """The own particles (n, D)."""
-        return self._local.mine.points
-
-    @property
-    def numbers(self) -> np.ndarray:
-        """The numbers (n,) of the own particles in the whole cloud."""
-        return self._local.mine.number
 
     def __len__(self) -> int:
         return len(self.values)

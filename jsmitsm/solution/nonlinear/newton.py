@@ -10,7 +10,7 @@ which the next fit is sought. It falls with the misfit (a driven cavity at order
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -22,20 +22,13 @@ from jsmitsm.equation.branches import FIELD
 from jsmitsm.runtime.errors import SolveError, some
 from jsmitsm.runtime.progress import bar
 from jsmitsm.runtime.tracers import concrete, is_traced
+from jsmitsm.solution.nonlinear.damped import DONE, GOOD, MOST, Found, damped
 from jsmitsm.solution.nonlinear.start import harmonic, start
-from jsmitsm.solution.nonlinear.steps import Frozen, Iterate, Record, advance, distance, mixed, raising, relaxed
+from jsmitsm.solution.nonlinear.steps import Iterate, Record, advance, distance, raising, relaxed
 from jsmitsm.solution.run import Run
 
-# Steps of one search. A step shorter than DONE of the solution is the last; shorter than GOOD it counts as converged.
-MOST, DONE, GOOD = 50, 1e-10, 1e-8
-# A damped step that must be cut below SHORTEST does not lead on, nor does a search of which so many steps were refused.
-SHORTEST, REFUSED = 1.0 / 16.0, 12
-# Round-off times this and the condition of the matrix may keep the steps from falling, up to a part ROUND_OFF of the
-# solution. Under jit, where no condition is known, steps below STALLED that do not fall are taken to be round-off.
-ROUNDING, ROUND_OFF, STALLED = 10 * np.finfo(float).eps, 1e-6, 1e-7
-# Steps of less than CLOSE of the solution that fall to no less than SLOW of the one before converge linearly, and are
-# mixed with up to DEPTH that came before.
-SLOW, CLOSE, DEPTH = 0.05, 2e-2, 4
+# Under jit, where no condition is known, steps below STALLED that do not fall are taken to be round-off.
+STALLED = 1e-7
 # Where only the first full step tells how large the solution is, it may be this much larger than that.
 WARY = 0.01
 NOTHING = "the equation says nothing"
@@ -107,15 +100,6 @@ def _first(run: Run, here: Iterate, free: bool) -> tuple[Iterate, Iterate]:
     return here, Iterate(*(np.full(np.shape(x), np.nan) for x in here))
 
 
-class Found(NamedTuple):
-    """Where a search ended: what its last step led to, how long that was, whether it converged, and who was frozen."""
-
-    at: Iterate
-    change: float
-    good: bool
-    frozen: np.ndarray
-
-
 def _refuse_degenerate(run: Run) -> None:
     """An equation of which nothing is left at a particle leaves its fit free there, and the system regular."""
     for _, nums, ids in run.operators():
@@ -131,7 +115,7 @@ def _searched(record: Record, begin: Iterate, first: Iterate) -> Found:
     """Damped steps; where they lead nowhere, those without depth, in pseudo-time, and in the end full ones."""
     if not np.isfinite(first.values).all():
         return Found(first, np.inf, False, np.zeros(0, int))
-    best = _damped(record, begin, first)
+    best = damped(record, begin, first)
     ways = ["damped steps"]
     if record.run.disc.rec.depth and not best.good:
         ways.append("steps without depth")
@@ -145,7 +129,7 @@ def _searched(record: Record, begin: Iterate, first: Iterate) -> Found:
         near = search(record, begin, first)
         step = None if near is None else record.tried(near)
         if near is not None and step is not None:
-            best = min(best, _damped(record, near, step), key=lambda found: (not found.good, found.change))
+            best = min(best, damped(record, near, step), key=lambda found: (not found.good, found.change))
     if not best.good:
         refuse_jumps_at(record.run, *best.at)
         record.run.fail(
@@ -162,55 +146,6 @@ def _searched(record: Record, begin: Iterate, first: Iterate) -> Found:
             "is sharper there than the cloud resolves; refine it."
         )
     return best
-
-
-def _damped(record: Record, here: Iterate, target: Iterate) -> Found:
-    """Damped Newton's method; the length of the next step must not grow (natural monotonicity)."""
-    # Lengths are absolute: measured against values that grow, a step that leads away looks shorter.
-    length, part, refused = distance(target, here), 1.0, 0
-    record.changes.append(length / target.size)
-    history, frozen = [(here, target)], Frozen(record.run.disc)
-
-    def found(good: bool = False) -> Found:
-        change = length / target.size
-        return Found(target, change, good or change <= GOOD, frozen.particles)
-
-    for _ in range(MOST):
-        if length <= DONE * target.size:
-            break
-        while True:
-            new = frozen.kept(here.toward(target, part) if len(history) < 2 else mixed(history))
-            after = record.tried(new)
-            next_length = np.inf if after is None else distance(after, new)
-            if after is not None and next_length <= max((1.0 - part / 4.0) * length, DONE * new.size):
-                break
-            if part == 1.0 and _rounded(record.run, length, next_length, target.size):
-                return found(True)
-            if len(history) > 1:
-                history = history[-1:]
-            elif part == 1.0 and length <= GOOD * target.size:
-                return found()
-            elif after is not None and length < CLOSE * target.size and frozen.more(here, target):
-                continue
-            elif part <= SHORTEST or refused == REFUSED:
-                return found()
-            else:
-                part, refused = part / 2.0, refused + 1
-        # What a full step leaves of a difference; a mixed one is shorter than that tells.
-        rate = distance(after, target) / max(distance(new, here), np.finfo(float).tiny)
-        record.rate = rate if part == 1.0 else record.rate
-        slow = part == 1.0 and rate > SLOW and next_length < CLOSE * after.size
-        history = [*(history[-DEPTH:] if slow else []), (new, after)]
-        here, target, length, part = new, after, next_length, min(1.0, 2.0 * part)
-        record.went(length, target.size)
-    return found()
-
-
-def _rounded(run: Run, length: float, after: float, size: float) -> bool:
-    """Whether a step no longer falls because round-off, amplified by the matrix, is as large."""
-    if length > ROUND_OFF * size or after > 100.0 * length or run.factor is None:
-        return False
-    return bool(length <= ROUNDING * run.factor.condition() * size)
 
 
 def _without_depth(record: Record, begin: Iterate) -> Found | None:
@@ -236,7 +171,7 @@ def _without_depth(record: Record, begin: Iterate) -> Found | None:
     more = disc.rec.size - low.rec.size
     near = found.at._replace(taylor=np.pad(found.at.taylor, ((0, 0), (0, 0), (0, more))))
     step = record.tried(near)
-    deep = None if step is None else _damped(record, near, step)
+    deep = None if step is None else damped(record, near, step)
     if deep is not None and deep.good:
         return deep
     run.become(other.run)

@@ -32,6 +32,9 @@ FIRST, SMALL, GROWTH = 0.5, 0.1, 2.0
 # From steps this short Newton's method goes on; so many solves at most, and so many times a step is cut in a row.
 NEAR, LONGEST, CUTS = 1e-3, 60, 4
 
+# Round-off times this and the condition of the matrix may keep the steps from falling, up to a part ROUND_OFF of the
+# solution.
+ROUNDING, ROUND_OFF = 10 * np.finfo(float).eps, 1e-6
 # Frozen together are the particles that move by this part of the most, and at most so many.
 MOVES, FEW = 0.3, 0.03
 
@@ -59,12 +62,20 @@ def distance(new: Iterate, old: Iterate) -> float:
     return float(np.abs(new.values - old.values).max())
 
 
-def mixed(history: list[tuple[Iterate, Iterate]]) -> Iterate:
-    """Anderson's mixing of iterates and what they led to, the last one last: their combination of the shortest step."""
-    steps = np.stack([(new.values - old.values).ravel() for old, new in history])
-    shares = np.linalg.lstsq((steps[:-1] - steps[-1]).T, -steps[-1], rcond=1e-10)[0]
+def shortest(
+    history: list[tuple[Iterate, Iterate]],
+    part: Callable[[Any], Any] = lambda values: values,
+    triangle: Callable[[np.ndarray], np.ndarray] = lambda columns: columns,
+) -> Iterate:
+    """Anderson's mixing of iterates and what they led to, the last one last: their combination of the shortest step.
+
+    part: of values, what counts here; triangle: of columns, whatever has the same least squares.
+    """
+    steps = np.stack([part(new.values - old.values).ravel() for old, new in history])
+    columns = triangle(np.concatenate([steps[:-1] - steps[-1], -steps[-1:]]).T)
+    shares = np.linalg.lstsq(columns[:, :-1], columns[:, -1], rcond=1e-10)[0]
     shares = np.append(shares, 1.0 - shares.sum())
-    return Iterate(*(sum(a * x for a, x in zip(shares, part)) for part in zip(*(new for _, new in history))))
+    return Iterate(*(sum(a * x for a, x in zip(shares, each)) for each in zip(*(new for _, new in history))))
 
 
 class Frozen:
@@ -109,7 +120,7 @@ def advance(run: Run, taylor: Any, altered: Callable[..., Any] | None = None) ->
 
 @dataclass
 class Record:
-    """What a search for a solution has done."""
+    """A search for a solution on one process, and what it has done; see ``damped.Search``."""
 
     run: Run
     shown: Any
@@ -127,6 +138,25 @@ class Record:
         except SolveError:
             return None
         return made if np.isfinite(made.values).all() and np.isfinite(made.taylor).all() else None
+
+    def size(self, here: Iterate) -> float:
+        return here.size
+
+    def distance(self, new: Iterate, old: Iterate) -> float:
+        return distance(new, old)
+
+    def mixed(self, history: list[tuple[Iterate, Iterate]]) -> Iterate:
+        return shortest(history)
+
+    def rounded(self, length: float, after: float, size: float) -> bool:
+        """Whether a step no longer falls because round-off, amplified by the matrix, is as large."""
+        factor = self.run.factor
+        if length > ROUND_OFF * size or after > 100.0 * length or factor is None:
+            return False
+        return bool(length <= ROUNDING * factor.condition() * size)
+
+    def frozen(self) -> Frozen:
+        return Frozen(self.run.disc)
 
     def went(self, change: float, size: float) -> None:
         """A step was taken, and the next one would be ``change`` long."""

@@ -13,7 +13,7 @@ from jsmitsm.discretization.regions.layout import discretize_regions
 from jsmitsm.discretization.regions.rows import RegionNumbers, region_numbers, whole_right_side, whole_table
 from jsmitsm.runtime.progress import bar
 from jsmitsm.runtime.tracers import is_traced
-from jsmitsm.solution.kept_matrix import KeptMatrix, refuse_other
+from jsmitsm.solution.kept_matrix import KeptMatrix, refuse_other, same_matrix
 from jsmitsm.solution.regions.run import RegionsRun
 from jsmitsm.solution.regions.solution import RegionsSolution
 from jsmitsm.solution.regions.solve import finished_regions, prepared_regions
@@ -73,7 +73,7 @@ class RegionsFactorization(KeptMatrix):
         ]:
             refuse_other()
         nums = region_numbers(disc)
-        if not _same_matrix(nums, self._nums):
+        if not same_matrix(nums, self._nums):
             return RegionsFactorization(problem, old.cloud, **self._options).solve(problem)
         run = copy(self._run)  # the solution's own: what it says of itself must not change with the next
         run.disc, run.problem = disc, disc.problem
@@ -92,12 +92,3 @@ class RegionsFactorization(KeptMatrix):
     def __repr__(self) -> str:
         disc = self._run.disc
         return f"Factorization({int((~disc.held).sum())} unknowns, regions={list(disc.cloud.regions)})"
-
-
-def _same_matrix(one: RegionNumbers, two: RegionNumbers) -> bool:
-    """Whether all that the matrix is made of is the same."""
-    pairs = [(getattr(a, n), getattr(b, n)) for a, b in zip(one.parts, two.parts) for n in ("jac", "own", "data")]
-    pairs += [(one.between[name][0], two.between[name][0]) for name in one.between]
-    if is_traced(pairs):
-        return False
-    return all(np.shape(a) == np.shape(b) and np.array_equal(np.asarray(a), np.asarray(b)) for a, b in pairs)

@@ -13,6 +13,7 @@ data that balance.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -40,7 +41,7 @@ from jsmitsm.solution.run import Run
 from jsmitsm.solution.unknowns.integral import IntegralTerm
 
 
-class Bordered(Run):
+class Bordered(Run, ABC):
     """A linear solve with rows and columns more: ``columns`` (n, K), ``lines`` (K, n), ``corner`` (K, K)."""
 
     def __init__(self, *args: Any):
@@ -89,9 +90,9 @@ class Bordered(Run):
         right = self._right_of(nums)
         return right if self.term is None else right + self.term.shift_of(nums.held)
 
+    @abstractmethod
     def sources_alone(self, nums: Any, make: Callable[[str | None, Any, Recursion], Any]) -> Any:
         """The numbers of the same operators without values of any kind, with other sources: see ``IntegralTerm``."""
-        raise NotImplementedError
 
     def at(self, unknowns: dict[str, Any], values: Any) -> Problem:
         """The problem with other unknowns; with an integral term that of these values (N, F)."""
@@ -104,24 +105,21 @@ class Bordered(Run):
     def bordering(self) -> int:
         return len(self.corner)
 
+    @abstractmethod
     def moved(self, unknowns: dict[str, Any], values: Any = None) -> Any:
         """The discretisation of the problem with other unknowns, and with values (N, F) of its integral term."""
-        raise NotImplementedError
 
+    @abstractmethod
     def numbers_of(self, disc: Any) -> Any:
         """The numbers of one of these."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _right_of(self, nums: Any) -> Any:
-        raise NotImplementedError
+        """The right-hand side (n,) without what an integral term adds."""
 
-    def operators_of(self, nums: Any) -> list[Any]:
-        """All numbers that the matrix is made of."""
-        raise NotImplementedError
-
+    @abstractmethod
     def fit(self, unknowns: dict[str, Any], values: Any, recipe: Recipe) -> Any:
         """What fits the local polynomials of values that belong to these unknowns."""
-        raise NotImplementedError
 
     def constants(self) -> np.ndarray:
         """Columns of ones (n, K) for the fields that are free up to a constant."""
@@ -174,9 +172,6 @@ class BorderedRun(Bordered):
         assert self.rows is not None
         return right_side(self.disc, nums, *self.rows)
 
-    def operators_of(self, nums: Numbers) -> list[Any]:
-        return [nums.jac, nums.own, nums.data]
-
     def sources_alone(self, nums: Numbers, make: Any) -> Numbers:
         return _alone(nums, make(None, self.disc.cloud.points[nums.ids], self.disc.rec))
 
@@ -198,10 +193,6 @@ class BorderedRegionsRun(Bordered, RegionsRun):
 
     def _right_of(self, nums: RegionNumbers) -> Any:
         return whole_right_side(self.disc, nums, self.parts, self.bound)
-
-    def operators_of(self, nums: RegionNumbers) -> list[Any]:
-        each = [getattr(own, name) for own in nums.parts for name in ("jac", "own", "data")]
-        return [*each, *(coef for coef, _ in nums.between.values())]
 
     def sources_alone(self, nums: RegionNumbers, make: Any) -> RegionNumbers:
         parts = [

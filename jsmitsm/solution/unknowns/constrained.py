@@ -200,7 +200,7 @@ def _response(run: Bordered, start: dict[str, Any]) -> Response:
     for name in names:
         disc = run.moved({**start, name: start[name] + 1.0})
         there = run.numbers_of(disc)
-        _refuse_in_operator(run.operators_of(nums), run.operators_of(there), name)
+        _refuse_in_operator(nums.of_matrix, there.of_matrix, name)
         columns.append(run.right_of(there) - right)
         held.append((there.held - nums.held)[run.disc.partner])
     xp: Any = jnp if is_traced(columns, held) else np
