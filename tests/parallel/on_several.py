@@ -188,6 +188,9 @@ def main():
         "first order": refused(lambda: jp.solve(
             js.Problem(lambda u, x: js.partial(u, (1, 0))(x), {**zero, "right": js.free()}), cloud)),
         "one process": refused(lambda: jp.solve(js.Problem(lap, zero), cloud if COMM.rank else None)),
+        "mass": refused(lambda: jp.eigen(
+            js.Problem(lambda u, x: jnp.stack([u(x)[1] - lap(u[0], x), lap(u[0], x)]), zero, fields=2), cloud, 1,
+            mass=(0.0, 1.0), order=4)),
         "array": refused(lambda: jp.solve(js.Problem(lap, {**zero, "top": js.dirichlet(np.zeros(3))}), cloud)),
     }  # fmt: skip
     if COMM.rank == 0:

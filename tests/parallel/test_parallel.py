@@ -130,9 +130,12 @@ def test_files(found):
         ("floating", "nothing fixes"), ("nonlinear", "nonlinear"), ("II", "'II' is none of"),
         ("periodic", "js.periodic is not made"), ("in time", "nonlinear problems in time"), ("lattice", "jp.read"),
         ("first order", "information travels"), ("one process", "on process 0"), ("array", "shape (3,)"),
+        ("mass", "write the operator"),
     ],
 )  # fmt: skip
 def test_what_is_not_made_is_refused_in_words(found, what, words):
     if what == "one process":  # the one that failed says it without
         words = "expected a js.Cloud"
+    if what == "mass" and "modes" not in found:
+        pytest.skip("modes need slepc4py")
     assert words in found["refused"][what]

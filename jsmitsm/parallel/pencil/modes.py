@@ -10,7 +10,7 @@ import numpy as np
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.discretization.pencil.assemble import default_depth
 from jsmitsm.equation.problem import Problem
-from jsmitsm.modes.eigen import check_question, refuse_data
+from jsmitsm.modes.eigen import check_question, refuse_data, refuse_mass
 from jsmitsm.modes.mass import is_operator, masses, weighted
 from jsmitsm.parallel.distributed import ParallelCloud, bisected, slab_of
 from jsmitsm.parallel.local import Local, OfOwn, Settings
@@ -112,6 +112,7 @@ def eigen(
     pencil = pencil_of_part(local, massed)
     with us.phase():
         refuse_data(local.disc, pencil)
+        refuse_mass(pencil, massed)
         weights, _ = masses(problem, local.cloud, mass)
         stiff, inert = pencil.A.part(pencil.free, pencil.free), weighted(problem, pencil, weights)
     a, c = own_rows(local, stiff), own_rows(local, inert)
