@@ -34,7 +34,7 @@ def ways(solver: str, elliptic: bool) -> tuple[str, ...]:
     wanted = (solver,) if solver != "auto" else ("hypre", "gamg", "mumps") if elliptic else ("mumps",)
     found = tuple(way for way in wanted if way == "gamg" or has(way))
     if not found:
-        raise ValueError(f"solver: {solver!r} needs {wanted[0]}, and this PETSc was built without; see docs/parallel.md")
+        raise ValueError(f"solver: {solver!r} needs {wanted[0]}, which this PETSc has not; see docs/parallel.md")
     return found
 
 
