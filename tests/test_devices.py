@@ -18,8 +18,7 @@ import jax; jax.config.update("jax_enable_x64", True)
 import jax.numpy as jnp, numpy as np
 import jsmitsm as js
 from jsmitsm.discretization import sharing
-from jsmitsm.particle import batches
-from jsmitsm.runtime import devices
+from jsmitsm.particle import devices
 sharing.PIECE = 32  # in pieces, side by side
 ends = dict.fromkeys(("left", "right", "bottom", "top"), js.dirichlet(0.0))
 cloud = js.rectangle((0, 0), (1, 1), (13, 13), jitter=0.2)

@@ -14,14 +14,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jsmitsm.particle import closure, moments
+from jsmitsm.particle import closure, devices, moments
 from jsmitsm.particle.closure import Recovery
 from jsmitsm.particle.elimination import Elimination, Scheme, eliminate
 from jsmitsm.particle.kernels import Kernel
 from jsmitsm.particle.moments import Block, Row, Support
 from jsmitsm.particle.recursion import fit_and_tail, row_lifts
 from jsmitsm.particle.source_fit import source_weights
-from jsmitsm.runtime import devices, one_kernel
+from jsmitsm.runtime import one_kernel
 from jsmitsm.runtime.compiled import at_hand
 from jsmitsm.runtime.compiler_options import on_cpu
 from jsmitsm.runtime.size_classes import BLOCK, FEW, cloud_size, padded_size

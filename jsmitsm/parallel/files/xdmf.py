@@ -1,4 +1,4 @@
-"""A solution in one HDF5 file, which the processes write in turn, and an XDMF file that tells ParaView what is in it."""
+"""A solution in an HDF5 file, which the processes write in turn, and an XDMF file that tells what is in it."""
 
 from __future__ import annotations
 
