@@ -90,11 +90,12 @@ class ParallelCloud:
         return f"ParallelCloud({len(self.slab)} of {self.slab.count} particles in {self.dim}D here)"
 
 
-def own_slab(us: Team, count: int) -> slice:
-    """The particles of this process before they are dealt anew."""
+def own_slab(us: Team, count: int, rank: int | None = None) -> slice:
+    """The particles of this process, or of another one, before they are dealt anew."""
     if count < us.size:
         raise ValueError(f"cloud: {count} particles for {us.size} processes; start fewer")
-    return slice(us.rank * count // us.size, (us.rank + 1) * count // us.size)
+    rank = us.rank if rank is None else rank
+    return slice(rank * count // us.size, (rank + 1) * count // us.size)
 
 
 def placed(us: Team, slab: Slab) -> Slab:
@@ -109,15 +110,15 @@ def placed(us: Team, slab: Slab) -> Slab:
     return replace(slab, place=place, sizes=sizes)
 
 
-def slab_of(us: Team, cloud: Any) -> Slab:
-    """This process's slab of a cloud that every process has, or of one in slabs."""
+def slab_of(us: Team, cloud: Any, rank: int | None = None) -> Slab:
+    """This process's slab of a cloud that every process has, or of one in slabs; or that of another process."""
     if isinstance(cloud, ParallelCloud):
         return cloud.slab
     if not isinstance(cloud, Cloud):
         raise ValueError(f"cloud: expected a js.Cloud or what jp.read returns, got {type(cloud).__name__}")
     if isinstance(cloud, RegionCloud):
         raise ValueError("cloud: several regions are not made for several processes; use js.solve")
-    some = own_slab(us, len(cloud))
+    some = own_slab(us, len(cloud), rank)
     group, place = np.zeros(len(cloud), int), np.zeros(len(cloud), int)
     for k, ids in enumerate(cloud.groups.values()):
         group[ids], place[ids] = k, np.arange(len(ids))

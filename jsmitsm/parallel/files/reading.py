@@ -72,8 +72,8 @@ def read(
 def _mapped(us: Team, points: Any, groups: Any, normals: Any, names: Any) -> Slab:
     if groups is None:
         raise ValueError("groups: an .npy of points needs another of integers, one a particle")
-    arrays = [None if path is None else np.load(path, mmap_mode="r") for path in (points, groups, normals)]
-    return _slab(us, *arrays, names)
+    mapped = lambda path: None if path is None else np.load(path, mmap_mode="r")  # noqa: E731
+    return _slab(us, mapped(points), mapped(groups), mapped(normals), names)
 
 
 def _from_hdf5(us: Team, path: str, groups: Any, normals: Any, names: Any) -> Slab:

@@ -14,6 +14,7 @@ from jsmitsm.evolution.march import LARGE, marched
 from jsmitsm.parallel.distributed import ParallelCloud, bisected, slab_of
 from jsmitsm.parallel.local import OfOwn, Settings
 from jsmitsm.parallel.pencil.run import ParallelRun, TimedLocal
+from jsmitsm.parallel.pencil.space import OwnSystem
 from jsmitsm.parallel.solving import refuse_others
 from jsmitsm.parallel.team import team
 from jsmitsm.runtime.arrays import ValueOrFunction
@@ -132,13 +133,14 @@ def evolve(
     later = float(history.in_time.at(times).max()) / (history.scale or 1.0) if history.in_time.times else None
     if later is not None and later > LARGE:
         run.flags.append(f"The estimated error in time is {later:.0%} of the solution: take more steps, or a tol.")
-    end = time.perf_counter()
+    end, system = time.perf_counter(), run.semi.system
+    assert isinstance(system, OwnSystem)
     stats = {
         "particles": local.mine.count, "own": len(local.halo.ids), "unknowns": local.size, "processes": us.size,
         "reach": local.halo.reach, "scheme": _NAMES[run.name], "steps": run.counts["steps"],
         "rejected": run.counts["rejected"], "pencils": run.counts["pencils"],
         "iterations": run.newton.counts["iterations"] if run.newton else 0, "damping": run.damping,
-        "error_in_time": later, "linear": run.semi.system.info,
+        "error_in_time": later, "linear": system.info,
         "seconds": {"pencil": made - began, "steps": end - made, "total": end - began},
     }  # fmt: skip
     return ParallelEvolution(times, states, rates, local, run.flags, stats)
