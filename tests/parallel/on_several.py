@@ -177,7 +177,7 @@ def _of_params():
         params = problem.params | {name: problem.params[name] + step}
         return float((js.solve(problem.replace(params=params), cloud, **CHEAP).u ** 2).sum())
 
-    def slope(name, h=2e-3):
+    def slope(name, h=5e-4):
         return (8.0 * (total(name, h) - total(name, -h)) - total(name, 2 * h) + total(name, -2 * h)) / (12.0 * h)
 
     near = js.stencils(cloud, size=9).__class__(js.solve(problem, cloud, **CHEAP)._fit.neighbours, None)

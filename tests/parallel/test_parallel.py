@@ -118,8 +118,9 @@ def test_modes_are_those_of_one_process(of_two):
         pytest.skip("modes need slepc4py")
     # Vectors lose the digits that a residual of 1e-13 leaves, over the gap to the next value.
     assert of_two["values of modes"] < 1e-11 and of_two["modes"] < 1e-9
-    # One process takes what is missed to first order, several the difference of the values themselves.
-    assert of_two["errors of modes"] < 0.2
+    # One process takes what is missed to first order, several the difference of the values themselves: at order 2 on
+    # 144 particles a quarter apart.
+    assert of_two["errors of modes"] < 0.5
 
 
 def test_parts_of_a_shape_are_the_whole(found):
@@ -141,7 +142,7 @@ def test_the_failure_of_one_and_an_interrupt_end_all():
 
 
 def test_gradients_are_those_of_one_process(of_two):
-    # Differences of step 2e-3 and fourth order miss some 1e-11.
+    # Differences of step 5e-4 and fourth order miss some 1e-11.
     assert of_two["value"] < 1e-11 and of_two["gradient"] < 1e-9
     # Central differences of step 1e-5 have errors of round-off over the step, and of its square.
     assert of_two["by points"] < 1e-6
