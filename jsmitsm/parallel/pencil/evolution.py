@@ -18,7 +18,7 @@ from jsmitsm.parallel.pencil.space import OwnSystem
 from jsmitsm.parallel.solving import refuse_others
 from jsmitsm.parallel.team import team
 from jsmitsm.runtime.arrays import ValueOrFunction
-from jsmitsm.runtime.errors import SolveError, did_you_mean, explaining
+from jsmitsm.runtime.errors import SolveError, did_you_mean, explained, explaining
 
 # Schemes that are made for several processes.
 SCHEMES = ("auto", "esdirk", "imex", "euler")
@@ -45,7 +45,7 @@ class ParallelEvolution(OfOwn):
     """
 
     def __init__(self, t: np.ndarray, u: np.ndarray, rates: Any, local: Any, flags: list[str], stats: dict[str, Any]):
-        self.t, self.flags, self.stats = t, flags, stats
+        self.t, self.flags, self.stats = t, explained(flags), stats
         one = u.shape[-1] == 1
         self.u = u[..., 0] if one else u
         self.rates = rates if rates is None or not one else rates[..., 0]
