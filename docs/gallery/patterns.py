@@ -32,7 +32,7 @@ start = lambda x: jnp.array([1.0, 0.9]) + ripple(x)
 dish = js.rectangle((0, 0), (24, 24), (19, 19))
 closed = dict.fromkeys(("left", "right", "bottom", "top"), js.neumann(0.0))
 run = js.evolve(
-    js.Problem(reaction, closed, fields=2), dish, start, t=(0, 160), steps=80,
+    js.Problem(reaction, closed, fields=2), dish, start, t=(0, 160), steps=160,
     save=[20, 40], progress=False,
 )
 growth = np.log(np.ptp(run.u[2][:, 0]) / np.ptp(run.u[1][:, 0])) / 20
