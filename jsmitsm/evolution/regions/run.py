@@ -6,7 +6,6 @@ import time
 from types import SimpleNamespace
 from typing import Any
 
-import jax
 import numpy as np
 
 from jsmitsm.discretization.regions.pencil import assemble_regions_pencil
