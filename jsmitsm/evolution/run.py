@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -22,7 +21,7 @@ from jsmitsm.evolution.steps.newton import Newton
 from jsmitsm.evolution.steps.stepping import RadauStepper, Step, Stepper
 from jsmitsm.evolution.steps.tableaux import EULER, KENCARP4, RADAU, Additive, Radau
 from jsmitsm.runtime.errors import is_number, some
-from jsmitsm.runtime.tracers import is_traced
+from jsmitsm.runtime.tracers import computed, is_traced
 
 # A quasilinear problem is linearised anew where its coefficients have changed by this part of themselves.
 DRIFT = 0.1
@@ -124,7 +123,7 @@ class Run:
         }  # fmt: skip
         reference = None
         if not timed.quasilinear:
-            with jax.ensure_compile_time_eval():  # under jit, too, what is known is computed
+            with computed():
                 pencil = assemble_pencil(problem, self.cloud, **options)
         else:
             problem.pde = timed.space  # type: ignore[assignment]
