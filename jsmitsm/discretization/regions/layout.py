@@ -62,6 +62,7 @@ class Regions:
     kernel: None = None
     part: None = None  # of a cloud that several processes share
     contrast: float = 1.0  # of the conductivities on both sides of an interface, the largest
+    squared: bool = False  # whether a region takes the least-squares form
 
     @property
     def rec(self) -> Recursion:
