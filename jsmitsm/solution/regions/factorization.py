@@ -72,6 +72,7 @@ class RegionsFactorization(KeptMatrix):
             p.disc.scheme for p in old.parts
         ]:
             refuse_other()
+        disc.contrast, disc.squared = old.contrast, old.squared
         nums = region_numbers(disc)
         if not same_matrix(nums, self._nums):
             return RegionsFactorization(problem, old.cloud, **self._options).solve(problem)
