@@ -175,10 +175,11 @@ def _region(
                 f"cloud: the region {name!r} is too small: {text[7:]}; reduce the spacing there, or lower the order"
             ) from None
         raise ValueError(f"{text} (in the region {name!r})") from error
-    if max(disc.traced.order) > 2 and len(cloud.interfaces):
+    highest = max(disc.traced.order)
+    if highest != 2 and len(cloud.interfaces):
         raise ValueError(
-            f"pde[{name!r}]: of order {max(disc.traced.order)}; interfaces take equations of second order, write it as "
-            "a system of them"
+            f"pde[{name!r}]: of order {highest}; interfaces bind values and fluxes of equations of second order, "
+            + ("write it as a system of them" if highest > 2 else "give it a diffusion that the spacing resolves")
         )
     if disc.scheme.n_data:
         raise ValueError(
