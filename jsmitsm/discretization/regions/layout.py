@@ -181,6 +181,12 @@ def _region(
             f"pde[{name!r}]: of order {highest}; interfaces bind values and fluxes of equations of second order, "
             + ("write it as a system of them" if highest > 2 else "give it a diffusion that the spacing resolves")
         )
+    lower = [f for f, less in enumerate(disc.rec.weights) if less]
+    if lower and len(cloud.interfaces):
+        raise ValueError(
+            f"pde[{name!r}]: field {lower[0]}, as a pressure, enters by fewer derivatives than the equations that know "
+            "it, and interfaces bind a value and a flux of every field; such systems are made for one region"
+        )
     if disc.scheme.n_data:
         raise ValueError(
             f"bcs: a side of the region {name!r} has more conditions than the equation has fields, which is not made "

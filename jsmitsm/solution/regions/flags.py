@@ -88,7 +88,7 @@ def _growth(regions: Regions, m: Meeting, points: np.ndarray, values: np.ndarray
         way, rise = points[near] - points[i], values[near] - values[i]
         distances.append(np.linalg.norm(way, axis=1))
         changes.append(np.abs(rise).max(axis=1))
-        rests.append(np.abs(_unlike_polynomials(way, rise)).max(axis=1))
+        rests.append(np.abs(unlike_polynomials(way, rise)).max(axis=1))
     r, change = np.concatenate(distances), np.concatenate(changes)
     first = r <= _RINGS[0] * r.min()
     second = (r <= _RINGS[1] * r.min()) & ~first
@@ -102,7 +102,7 @@ def _growth(regions: Regions, m: Meeting, points: np.ndarray, values: np.ndarray
     return float(power), size[0]
 
 
-def _unlike_polynomials(way: np.ndarray, rise: np.ndarray) -> np.ndarray:
+def unlike_polynomials(way: np.ndarray, rise: np.ndarray) -> np.ndarray:
     """What is left of the differences ``rise`` (n, F) to a particle's values by quadratic polynomials of the offsets
     ``way`` (n, D), linear ones where neighbours are few; the nearest count most."""
     n, dim = way.shape

@@ -207,13 +207,18 @@ class RegionsRun(Run):
         cleared = share <= flags.CLEARED
         return [*certain, *([] if cleared else doubts), *told, *self.against]
 
+    def _forms(self) -> Any:
+        """The form of the global system; where regions differ, that of each."""
+        forms = {p.name: "lsq" if p.name in self.squared else "loo" for p in self.disc.parts}
+        return forms if len(set(forms.values())) > 1 else next(iter(forms.values()))
+
     def stats(self) -> dict[str, Any]:
         """What a user may want to know about the solve."""
         disc = self.disc
         out: dict[str, Any] = {
             "seconds": dict(self.seconds), "depth": disc.rec.depth, "particles": len(disc.cloud),
             "unknowns": int((~disc.held).sum()), "neighbours": int(disc.near.shape[1]), "linear": self.linear,
-            "formulation": self.formulation, "skipped": [], "messages": list(self.messages),
+            "formulation": self._forms(), "skipped": [], "messages": list(self.messages),
             "regions": {p.name: len(p.ids) for p in disc.parts}, "copies": sum(len(m.copies) for m in disc.meetings),
         }  # fmt: skip
         if self.changes:
