@@ -226,7 +226,8 @@ def test_a_fluid_carries_heat_along_a_solid(formulation):
     assert np.abs(sol.u[pairs[:, 0]] - sol.u[pairs[:, 1]] - jump).max() < 1e-12
     assert sol.stats["formulation"] == ({"solid": "loo", "fluid": "lsq"} if formulation == "auto" else "lsq")
     # A layer within the spacing at a held outflow is told, as in one region.
-    hot = {"in": js.dirichlet(0.0), "out": js.dirichlet(1.0), "rest": js.neumann(0.0), "solid|fluid": js.interface(conduction(k))}
+    hot = {"in": js.dirichlet(0.0), "out": js.dirichlet(1.0), "rest": js.neumann(0.0)}
+    hot |= {"solid|fluid": js.interface(conduction(k))}
     told = js.solve(js.Problem({"solid": laplace, "fluid": wind}, hot), cloud, order=2, formulation=formulation)
     assert any("no function fits the equation" in flag for flag in told.flags)
 
@@ -268,9 +269,9 @@ def test_conditions_are_never_guessed():
     turned = {"a": flux["a"], "b": lambda u, x, n: -2.0 * n @ js.grad(u)(x)}
     refused(r"opposite signs.*same n, which points from 'a' to 'b'", bcs={**ends, "a|b": js.interface(turned)})
     refused(r"method: III is not made for clouds of several regions", method="III")
-    for low, of_order in ((4, lambda u, x: js.partial(u, (4,))(x)), (1, lambda u, x: js.grad(u)(x)[0]),
-                          (0, lambda u, x: u(x) - 1.0)):  # fmt: skip
-        refused(rf"of order {low}; interfaces bind values and fluxes of equations of second", pde={**both, "b": of_order})
+    orders = {4: lambda u, x: js.partial(u, (4,))(x), 1: lambda u, x: js.grad(u)(x)[0], 0: lambda u, x: u(x) - 1.0}
+    for order, other in orders.items():
+        refused(rf"of order {order}; interfaces bind values and fluxes of equations", pde={**both, "b": other})
     dot = js.sdf.circle((0.0, 0.0), 0.15)
     small = js.regions({"a": dot, "b": js.sdf.difference(js.sdf.rectangle(*BOX), dot)}, BOX, 0.1)
     refused(r"region 'a' is too small: .* particles are too few", cloud=small, order=8)

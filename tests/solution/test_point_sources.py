@@ -52,7 +52,7 @@ def test_greens_function_of_the_disk(boundary):
 
 
 def test_a_regular_part_of_round_off_is_no_flag():
-    """With its own singular part for boundary values a source leaves nothing to solve for, whatever its noise is like."""
+    """With its own singular part for boundary values a source leaves nothing to solve for."""
     log = lambda x: 0.5 * jnp.log((x - Y) @ (x - Y)) / (2 * jnp.pi)  # noqa: E731
     own = js.dirichlet(jax.vmap(log)(DISK.points[DISK.groups["boundary"]]))
     for given, told in ((own, []), (js.dirichlet(0.0), ["rough"])):

@@ -114,7 +114,7 @@ class RegionsRun(Run):
         for part, own in zip(self.disc.parts, nums.parts):
             if own.degenerate is not None and len(own.degenerate.empty):
                 self._fail_empty(part.ids[own.degenerate.empty])
-            if self.form == "auto" and information_travels(part.disc, own, CARRIED):
+            if self.form == "auto" and information_travels(part.disc, own.jac, CARRIED):
                 self.squared.add(part.name)
         self.disc.squared = bool(self.squared)
         if not is_traced(nums.between):
