@@ -16,7 +16,7 @@ WEAK = 10.0
 # Around a point where regions meet, values that grow as a lower power of the distance than this are singular there, if
 # what they grow by in the nearest ring makes this part of the range. Smooth ones grow with power one at the least.
 POWER, PART = 0.75, 0.02
-# ... unless quadratic polynomials leave less than this of the change in the nearest ring: unlike directions are no power.
+# ... unless quadratic polynomials leave less than this of the change in the nearest ring: unlike ways are no power.
 # Measured with jittered particles: r^0.39 leaves 0.17 to 0.3 of it, r^0.67 0.1 to 0.2, exp(r / 3) up to 0.07.
 SMOOTH = 0.08
 # The rings, in distances of the nearest neighbour.
