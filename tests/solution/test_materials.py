@@ -274,6 +274,11 @@ def test_conditions_are_never_guessed():
     for order, other in orders.items():
         pde, bcs = {**both, "a": other}, None if order else free
         refused(rf"of order {order}; interfaces bind values and fluxes of equations", pde=pde, bcs=bcs)
+    flow = lambda u, x: jnp.array([js.laplacian(u[0])(x) - js.grad(u[1])(x)[0], js.grad(u[0])(x)[0]])  # noqa: E731
+    force = dict.fromkeys("ab", lambda u, x, n: jnp.array([n @ js.grad(u[0])(x) - u[1](x), u[1](x)]))
+    with pytest.raises(ValueError, match="field 1, as a pressure, enters by fewer derivatives"):
+        held = {"boundary": js.dirichlet(0.0, field=0), "a|b": js.interface(force)}
+        js.solve(js.Problem(dict.fromkeys("ab", flow), held, fields=2), cloud)
     dot = js.sdf.circle((0.0, 0.0), 0.15)
     small = js.regions({"a": dot, "b": js.sdf.difference(js.sdf.rectangle(*BOX), dot)}, BOX, 0.1)
     refused(r"region 'a' is too small: .* particles are too few", cloud=small, order=8)
