@@ -299,7 +299,7 @@ def in_whole(part: Part, cls: Class) -> Class:
 
 
 def whole_right_side(
-    regions: Regions, nums: RegionNumbers, rows: list[tuple[list[Class], list[Row]]], bound: list[Any]
+    regions: Regions, nums: RegionNumbers, rows: list[tuple[list[Class], list[Any]]], bound: list[Any]
 ) -> Any:
     """The right-hand side (n,) of the whole system.
 
