@@ -11,7 +11,7 @@ import numpy as np
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.cloud.regions.region_cloud import RegionCloud
 from jsmitsm.equation.unknowns.point_source import Kelvin, Singular, derivative_of
-from jsmitsm.runtime.tracers import concrete
+from jsmitsm.runtime.tracers import concrete, is_traced
 from jsmitsm.solution.evaluation import checked_points, in_domain
 from jsmitsm.solution.flags import NOTHING
 from jsmitsm.solution.regions.located import located
@@ -133,6 +133,8 @@ class RegionsPointSolution(RegionsSolution):
 
 def _negligible(sol: Any) -> bool:
     """Whether the regular part is round-off beside the whole, at the particles."""
+    if is_traced(sol.regular.u, sol.u):
+        return False
     regular, whole = (np.abs(np.asarray(x, float)) for x in (sol.regular.u, sol.u))
     return bool(regular.max(initial=0.0) <= NOTHING * whole[np.isfinite(whole)].max(initial=0.0))
 
