@@ -27,9 +27,9 @@ def saddle(rec: Recursion) -> bool:
     return any(rec.weights)
 
 
-def information_travels(disc: Discretization, coefficients: Any) -> bool:
+def information_travels(disc: Discretization, coefficients: Any, most: float = 2.0) -> bool:
     """Whether information travels: operators of first order, hyperbolic and parabolic ones of second,
-    and those whose convection outweighs diffusion between neighbours (cell Peclet number above 2).
+    and those whose convection outweighs diffusion between neighbours (cell Peclet number above ``most``).
 
     There a value predicted by neighbours on all sides is the wrong global form. coefficients: as ``Numbers.jac``.
     """
@@ -62,8 +62,8 @@ def information_travels(disc: Discretization, coefficients: Any) -> bool:
     speed = np.linalg.norm(jac[0, drift, 0], axis=0)
     convective = speed * mean_spacing(disc) / np.where(diffusion > 0, diffusion, np.inf)
     if disc.part is None:
-        return bool(np.median(convective) > 2.0)
-    above, below = _all_told(disc, (convective > 2.0).sum(), (convective <= 2.0).sum())
+        return bool(np.median(convective) > most)
+    above, below = _all_told(disc, (convective > most).sum(), (convective <= most).sum())
     return bool(above > below)
 
 
@@ -95,8 +95,9 @@ def cell_peclet(disc: Discretization, nums: Numbers) -> float:
 
 def usual_condition(disc: Discretization) -> float:
     """Of the order of the condition of a regular system: n^(m/D) for an operator of order m, times the contrast of
-    conductivities where there are several regions."""
-    return float(len(disc.cloud) ** (max(disc.rec.orders) / disc.rec.dim)) * getattr(disc, "contrast", 1.0)
+    conductivities where there are several regions; squared where one of these takes the least-squares form."""
+    usual = float(len(disc.cloud) ** (max(disc.rec.orders) / disc.rec.dim)) * getattr(disc, "contrast", 1.0)
+    return usual**2 if getattr(disc, "squared", False) else usual
 
 
 def wave_number(disc: Discretization, nums: Numbers) -> float:

@@ -93,12 +93,11 @@ def flags(run: Any, values: Any, nums: Any, estimated: Callable[[], float]) -> t
         test(run, values, nums, certain, found)
     for test in (_condition, _misfit, _waves, _roughness, _source, _coefficients, _weakness, _peclet):
         test(run, values, nums, doubts, found)
-    most = MISFIT if found["peclet"] > CARRIED else HOPELESS_MISFIT
     singular = found.get("excess", 0.0) > SINGULAR[run.formulation]
     # Near a resonance the last digits of the source decide, and the estimate passes through the same inverse.
     resonant = singular and found.get("source", 0.0) > OVERWHELMING
     blind = found.get("excess", 0.0) > BLIND or found.get("coefficient", 0.0) > DIVERGENT
-    if certain or resonant or blind or found.get("misfit", 0.0) > most:
+    if certain or resonant or blind or hopeless(found):
         return doubts + certain, found
     if len(run.disc.cloud) > MANY or _cleared(run, found, doubts):
         return doubts + certain, found
@@ -113,6 +112,11 @@ def flags(run: Any, values: Any, nums: Any, estimated: Callable[[], float]) -> t
         f"Between the particles the equation is missed by as much as makes {missed:.0%} of the solution: the source or "
         "a coefficient changes within the spacing, unseen by the particles; refine there, or smooth it."
     ], found
+
+
+def hopeless(found: dict[str, float]) -> bool:
+    """Whether the local fits miss so much that no estimate is a judge of it."""
+    return found.get("misfit", 0.0) > (MISFIT if found["peclet"] > CARRIED else HOPELESS_MISFIT)
 
 
 def _cleared(run: Any, found: dict[str, float], doubts: list[str]) -> bool:
@@ -194,7 +198,7 @@ def _round_off(run: Any, values: np.ndarray, nums: Any, out: list[str], found: d
     if run.factor is None:
         return
     found["condition"] = run.factor.condition()
-    if run.rows is None:
+    if not run.rows or not run.rows[1]:
         found["round_off"] = float(np.finfo(float).eps) * found["condition"]
         if found["round_off"] > ROUND_OFF:
             out.append(
@@ -342,7 +346,7 @@ def _waves(run: Any, values: np.ndarray, nums: Any, out: list[str], found: dict[
 
 def _far_away(run: Any, values: np.ndarray, nums: Any, out: list[str], found: dict[str, float]) -> None:
     """Far from the origin the coordinates themselves lose digits, and with them source and boundary values."""
-    if run.rows is None:
+    if not run.rows or not run.rows[1]:
         return
     dtype = np.asarray(run.rows[1][0].weights).dtype
     far = float(np.abs(np.asarray(run.disc.cloud.points)).max())
@@ -356,4 +360,4 @@ def _far_away(run: Any, values: np.ndarray, nums: Any, out: list[str], found: di
 
 # The tests that ask the whole system, and those that ask one region of several alone.
 OF_THE_WHOLE = (_round_off, _condition, _far_away)
-OF_A_REGION = (_jumps, _contradictions, _waves, _roughness, _coefficients, _peclet)
+OF_A_REGION = (_jumps, _contradictions, _misfit, _waves, _roughness, _coefficients, _peclet)

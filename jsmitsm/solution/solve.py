@@ -86,7 +86,7 @@ def solve(
         Keep only the first so many free coefficients (I, II, III).
     formulation : {"auto", "loo", "lsq"}
         "loo" (each value is predicted by its neighbours), "lsq" (least squares over all local fits) or "auto": "lsq"
-        where information travels, and in systems with a pressure; else "loo".
+        where information travels, and in systems with a pressure; else "loo". With several regions, region by region.
     solver : {"auto", "dense", "sparse", "mixed", "iterative"}
         "auto", "dense" (pure JAX), "sparse" (direct), "mixed" (direct, its factors in float32 and the rest in
         float64: two thirds of the time and memory) or "iterative".
