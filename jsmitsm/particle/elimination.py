@@ -292,7 +292,7 @@ def _deepened_on_host(
 ) -> tuple[np.ndarray, np.ndarray]:
     rec = scheme.rec
     low, high, first, deeper = fit_and_tail(rec)
-    size = _fischer(rec)[high]
+    size = _fischer(rec, scheme.farthest)[high]
     deep = matrix[np.ix_(deeper, high)] * size
     unit = _row_lengths(deep, np)
     spread = np.concatenate([deep / unit[:, None], np.sqrt(_ridge(scheme)) * np.eye(len(deeper))], axis=1)
