@@ -249,16 +249,12 @@ def unconstrained(scheme: Scheme) -> tuple[Scheme, Elimination]:
 
 def eliminate_on_host(scheme: Scheme, jac: np.ndarray, length: float = 1.0) -> Elimination:
     """``eliminate`` in numpy, where one elimination serves many particles; kept for later."""
-    bare = Scheme(
-        scheme.method, scheme.rec, scheme.free, scheme.dependent, flat=scheme.flat, uneven=scheme.uneven
-    )
+    bare = Scheme(scheme.method, scheme.rec, scheme.free, scheme.dependent, flat=scheme.flat, uneven=scheme.uneven)
     return _eliminated_once(bare, jac.tobytes(), jac.shape, jac.dtype.str, length)
 
 
 @lru_cache(maxsize=256)
-def _eliminated_once(
-    scheme: Scheme, numbers: bytes, shape: tuple[int, ...], dtype: str, length: float
-) -> Elimination:
+def _eliminated_once(scheme: Scheme, numbers: bytes, shape: tuple[int, ...], dtype: str, length: float) -> Elimination:
     made = _eliminated(scheme, np.frombuffer(numbers, dtype).reshape(shape), length)
     for part in made:
         part.setflags(write=False)
