@@ -93,7 +93,7 @@ def draw(lines: list[dict[str, Any]]) -> None:
                 run = [v for v in lines if (v["kind"], v["order"], v["depth"]) == (kind, order, depth)]
                 x, y = [v["per wavelength"] for v in run], [v["error"] for v in run]
                 ax.loglog(x, y, style, color=colour, marker=".", ms=4, lw=1.3, label=f"order {order}, depth {depth}")
-        ax.set(title=title, xlabel="particles a wavelength", ylim=(1e-13, 10))
+        ax.set(title=title, xlabel="particles a wavelength", ylim=(1e-11, 10))
         ax.set_xticks([3, 4, 5, 6, 8, 10, 13], ["3", "4", "5", "6", "8", "10", "13"], minor=False)
         ax.set_xticks([], minor=True)
         ax.grid(alpha=0.3)
