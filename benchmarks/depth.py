@@ -211,8 +211,8 @@ def cost() -> dict[str, Any]:
 
 # Orders, spacings and errors at which the least seconds are looked for.
 REACHED = {
-    "conductor": ((6, 8), (0.1, 0.08, 0.06, 0.042), (1e-6, 1e-8, 1e-10)),
-    "waves": ((8, 10), (0.06, 0.042, 0.028, 0.02), (1e-4, 1e-6, 1e-8)),
+    "conductor": ((4, 6, 8), (0.16, 0.13, 0.1, 0.08), (1e-6, 1e-8, 1e-10)),
+    "waves": ((6, 8, 10), (0.06, 0.042, 0.028, 0.02), (1e-3, 1e-4, 1e-6)),
 }
 
 
