@@ -17,10 +17,9 @@ from jsmitsm.discretization.layout import Class, Discretization
 from jsmitsm.discretization.least_squares import least_squares
 from jsmitsm.discretization.leave_one_out import right_side
 from jsmitsm.discretization.periodic import with_corners
+from jsmitsm.discretization.resolution.residuals import residual
 from jsmitsm.discretization.rows import all_coefficients, all_rows
 from jsmitsm.equation.problem import Problem
-from jsmitsm.particle.polynomials import derivative_table
-from jsmitsm.taylor.multi_indices import multi_indices
 
 # A particle of the same group so many times as far as the nearest ones of all, or whose normal has less than this part
 # of the direction, is not beside.
@@ -99,7 +98,7 @@ def seam(run: Any, values: Any) -> np.ndarray:
     owner, points = disc.partner[aside], np.asarray(disc.cloud.points, float)
     fitted = np.asarray(all_coefficients(disc, nums, values), float)[owner]
     nowhere = np.zeros((len(aside), disc.rec.dim))
-    missed = [_residual(disc, run.problem, points[at], nowhere, fitted) for at in (aside, owner)]
+    missed = [residual(disc, run.problem, points[at], nowhere, fitted) for at in (aside, owner)]
     place = np.full(len(disc.cloud), -1)
     place[nums.ids] = np.arange(len(nums.ids))
     source = np.zeros((disc.rec.n_rows, len(nums.ids)))
@@ -159,23 +158,7 @@ def _mean(disc: Discretization, problem: Problem, cls: Class, points: np.ndarray
     for k in range(near.shape[1]):
         there = near[:, k] >= 0
         offset = 0.5 * (points[np.where(there, near[:, k], cls.ids)] - points[cls.ids])
-        found = _residual(disc, problem, points[cls.ids] + offset, offset, fitted[cls.ids])
+        found = residual(disc, problem, points[cls.ids] + offset, offset, fitted[cls.ids])
         total += np.where(there, found, 0.0)
         count += there
     return total / count
-
-
-def _residual(disc: Discretization, problem: Problem, at: np.ndarray, offset: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """The residual (E, n) of polynomials u (n, F, K) at their centres plus ``offset``."""
-    rec, traced = disc.rec, disc.traced
-    powers = np.stack([np.prod(offset ** np.array(a), axis=1) for a in multi_indices(rec.dim, rec.reach)], axis=1)
-    slots = []
-    for f, b in traced.slots:
-        lower, factor = derivative_table(rec.dim, rec.reach, b)
-        slots.append(np.einsum("nk,nk->n", u[:, f], powers[:, lower] * factor))
-    value = np.stack(slots)[:, None]
-    if not traced.linear:
-        return np.asarray(traced.coefficients(at, 0, params=problem.params, slots=value)[1])[:, 0]
-    jac, source = traced.coefficients(at, 0, params=problem.params)
-    found = np.einsum("esn,sn->en", np.broadcast_to(np.asarray(jac)[:, :, 0], (*jac.shape[:2], len(at))), value[:, 0])
-    return found if source is None else found + np.asarray(source)[:, 0]

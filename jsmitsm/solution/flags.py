@@ -282,7 +282,7 @@ def _source(run: Any, values: np.ndarray, nums: Any, out: list[str], found: dict
 def _coefficients(run: Any, values: np.ndarray, nums: Any, out: list[str], found: dict[str, float]) -> None:
     if np.shape(nums.jac)[-1] == 1:
         return
-    steep = steepness(run.disc, nums)
+    steep = steepness(run.disc, nums, run.problem, values, DIVERGENT)
     found["coefficient"] = float(steep.max(initial=0.0))
     bad = np.flatnonzero(steep > COEFFICIENT)
     if len(bad):
@@ -295,7 +295,7 @@ def _coefficients(run: Any, values: np.ndarray, nums: Any, out: list[str], found
 def _jumps(run: Any, values: np.ndarray, nums: Any, out: list[str], found: dict[str, float]) -> None:
     if np.shape(nums.jac)[-1] == 1:
         return
-    bad = np.flatnonzero(unseen(run.disc, nums, run.problem))
+    bad = np.flatnonzero(unseen(run.disc, nums, run.problem, values))
     found["jumps"] = len(bad)
     if len(bad):
         out.append(
