@@ -56,7 +56,10 @@ def unseen_data(run: Any) -> np.ndarray:
     if not any(x.any() for x in found):
         return np.zeros(disc.held.shape)
     held, given, gamma = found
-    return _made_of(run, replace(run.nums, source=zero(run.nums.source), held=held, given=given, gamma=gamma))
+    made = _made_of(run, replace(run.nums, source=zero(run.nums.source), held=held, given=given, gamma=gamma))
+    # A velocity that is zero has no scale to measure what the other's data make of it with.
+    own = held.any(axis=0)
+    return np.where(own if own.any() else True, made, 0.0)
 
 
 def _halfway(disc: Discretization, cloud: Cloud, k: int) -> tuple[Cloud, np.ndarray]:

@@ -80,8 +80,8 @@ def correction(fit: Fit, values: Any) -> Correction:
     the solution's own: A_p^-1 D (b_{p+2} - A_{p+2} u_p). D brings the rows of the two orders to one scale, that of the
     source in them, and rows of one-sided stencils count less: they amplify what order p + 2 misses itself.
     Solutions of other methods, whose rows are no such predictions, and of the least-squares form, whose rows have no
-    common scale, are compared with that of method S of order p + 2 (in that form see ``_by_misfits``). Held values have no error; where p + 2 is no
-    better than p (no smoothness, or round-off) the estimate says little.
+    common scale, are compared with that of method S of order p + 2 (in that form see ``_by_misfits``). Held values
+    have no error; where p + 2 is no better than p (no smoothness, or round-off) the estimate says little.
     """
     low = fit.discretization()
     if fit.recipe.formulation == "lsq" or fit.recipe.method != "S":

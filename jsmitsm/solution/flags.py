@@ -3,9 +3,9 @@
 None of the tests costs a moment system: some solves with the kept factors and sums over neighbours.
 They clear what is linear, of one field and far from their bounds. Everywhere else the error estimate
 (``js.Solution.error_estimate``) is asked, which costs another assembly of a higher order, and decides: it clears
-what was only suspected, and is a flag itself where it is large. What no particle sees neither sees, and is looked for by
-itself (``jsmitsm.solution.between``). A healthy solution has no flags. A flag is no proof of an error, nor its absence
-one of accuracy.
+what was only suspected, and is a flag itself where it is large. What no particle sees it does not see either, and
+is looked for by itself (``jsmitsm.solution.between``). A healthy solution has no flags. A flag is no proof of an
+error, nor its absence one of accuracy.
 """
 
 from __future__ import annotations
