@@ -24,6 +24,9 @@ from jsmitsm.equation.problem import Problem
 # A particle of the same group so many times as far as the nearest ones of all, or whose normal has less than this part
 # of the direction, is not beside.
 NEAR, ASIDE = 1.5, 0.5
+# A coefficient or a source halfway is even where it differs from the mean of both ends by less than this part of them,
+# or of so small a part of the largest anywhere: ten particles a wavelength leave 0.05.
+UNEVEN, SMALL = 0.2, 0.01
 
 
 def between(run: Any, values: Any) -> np.ndarray:
@@ -32,6 +35,39 @@ def between(run: Any, values: Any) -> np.ndarray:
     if disc.linear and disc.traced.constant and disc.traced.source != "variable":
         return np.zeros(disc.held.shape)
     return _made_of(run, unresolved(disc, run.nums, run.problem, values))
+
+
+def even(run: Any) -> bool:
+    """Whether source and coefficients of a linear problem are halfway to the neighbours what they are on both ends.
+
+    A look without polynomials: where it sees nothing, there is no need of theirs.
+    """
+    disc, points = run.disc, np.asarray(run.disc.points, float)
+    if not disc.linear or disc.traced.constant and disc.traced.source != "variable":
+        return disc.linear
+
+    def at(x: np.ndarray) -> np.ndarray:
+        jac, source = disc.traced.coefficients(x, 0, params=run.problem.params)
+        parts = [np.asarray(jac)[:, :, 0]] + ([] if source is None else [np.asarray(source)[:, None, 0]])
+        return np.concatenate([np.broadcast_to(p, (*p.shape[:2], len(x))) for p in parts], axis=1)
+
+    known = at(points)
+    largest = np.abs(known).max(axis=2, keepdims=True)
+    for cls in disc.classes:
+        near = _looked_at(disc, cls)
+        for other in near.T:
+            ids, to = cls.ids[other >= 0], other[other >= 0]
+            there, ends = at(0.5 * (points[ids] + points[to])), (known[:, :, ids], known[:, :, to])
+            size = np.maximum(np.maximum(*map(np.abs, ends)), SMALL * largest)
+            if (np.abs(there - 0.5 * (ends[0] + ends[1])) > UNEVEN * size).any():
+                return False
+    return True
+
+
+def _looked_at(disc: Discretization, cls: Class) -> np.ndarray:
+    """The neighbours (n, k) halfway to which one looks: on a lattice those along its axes and across its cells."""
+    dim = disc.rec.dim
+    return np.asarray(cls.neighbours)[:, 1 : 1 + 2 * dim + (2**dim if dim > 1 else 0)]
 
 
 def unseen_data(run: Any) -> np.ndarray:
@@ -134,9 +170,8 @@ def _made_of(run: Any, nums: Numbers) -> np.ndarray:
 def unresolved(disc: Discretization, nums: Numbers, problem: Problem, values: Any) -> Numbers:
     """The numbers of the same operator with, for its source, what the polynomials leave of the residual.
 
-    The residual is looked at halfway to the nearest neighbours, on a lattice those along its axes and across its cells,
-    and averaged: a source or a coefficient that the particles do not see, or whose Taylor series ends before it reaches
-    the neighbours, shows there.
+    The residual is looked at halfway to the nearest neighbours, and averaged: a source or a coefficient that the
+    particles do not see, or whose Taylor series ends before it reaches the neighbours, shows there.
     """
     fitted = np.asarray(all_coefficients(disc, nums, values), float)
     points, place = np.asarray(disc.points, float), np.full(len(disc.cloud), -1)
@@ -155,8 +190,7 @@ def _with_source(nums: Numbers, source: np.ndarray) -> Numbers:
 
 def _mean(disc: Discretization, problem: Problem, cls: Class, points: np.ndarray, fitted: np.ndarray) -> np.ndarray:
     """The mean residual (E, n) around every particle of a class, whose own share of it is zero."""
-    dim = disc.rec.dim
-    near = np.asarray(cls.neighbours)[:, 1 : 1 + 2 * dim + (2**dim if dim > 1 else 0)]
+    near = _looked_at(disc, cls)
     total, count = np.zeros((len(disc.rec.orders), len(cls.ids))), np.ones(len(cls.ids))
     for k in range(near.shape[1]):
         there = near[:, k] >= 0

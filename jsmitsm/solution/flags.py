@@ -25,7 +25,7 @@ from jsmitsm.discretization.resolution.steepness import steepness, unseen
 from jsmitsm.discretization.rows import all_rows
 from jsmitsm.runtime.errors import some
 from jsmitsm.runtime.tracers import is_traced
-from jsmitsm.solution.between import between, seam, unseen_data
+from jsmitsm.solution.between import between, even, seam, unseen_data
 
 # A particle may differ from the linear function through its neighbours by this part of the
 # range; a sine of six particles a wavelength differs by 0.25. By order: up to 3, and above.
@@ -108,17 +108,18 @@ def flags(run: Any, values: Any, nums: Any, estimated: Callable[[], float]) -> t
         return doubts + certain, found
     if len(run.disc.cloud) > MANY:
         return doubts, found
-    if not _cleared(run, found, doubts):
+    cleared = _cleared(run, found, doubts)
+    if not cleared:
         found["estimate"] = estimated()
         if found["estimate"] > (TURNED if found.get("turned") else CLEARED):
             return doubts, found
     # Near a resonance any residual grows without bound, that of the truncation too; the estimate has its signs.
-    return [] if singular else _unseen(run, values, found), found
+    return [] if singular else _unseen(run, values, found, cleared and even(run)), found
 
 
-def _unseen(run: Any, values: np.ndarray, found: dict[str, float]) -> list[str]:
-    """What no particle sees, and with them no estimate: between them, and on the other side of a seam."""
-    found["missed"] = missed = share(between(run, values), values)
+def _unseen(run: Any, values: np.ndarray, found: dict[str, float], nothing: bool) -> list[str]:
+    """What no particle sees, and with them no estimate: between them (``nothing`` there), and beyond a seam."""
+    found["missed"] = missed = 0.0 if nothing else share(between(run, values), values)
     found["data"] = data = share(unseen_data(run), values)
     found["seam"] = beyond = share(seam(run, values), values)
     told = []
