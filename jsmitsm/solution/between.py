@@ -94,8 +94,8 @@ def unseen_data(run: Any) -> np.ndarray:
     held, given, gamma = found
     made = _made_of(run, replace(run.nums, source=zero(run.nums.source), held=held, given=given, gamma=gamma))
     # A velocity that is zero has no scale to measure what the other's data make of it with.
-    own = held.any(axis=0)
-    return np.where(own if own.any() else True, made, 0.0)
+    given_in = held.any(axis=0)
+    return np.where(given_in if given_in.any() else True, made, 0.0)
 
 
 def _halfway(disc: Discretization, cloud: Cloud, k: int) -> tuple[Cloud, np.ndarray]:

@@ -30,8 +30,7 @@ def _evaluated(disc: Discretization, problem: Problem, at: np.ndarray, offset: n
         lower, factor = derivative_table(rec.dim, rec.reach, b)
         slots.append(np.einsum("nk,nk->n", u[:, f], powers[:, lower] * factor))
     value = np.stack(slots)
-    given = {} if traced.linear else {"slots": value[:, None]}
-    jac, source = traced.coefficients(at, 0, params=problem.params, **given)
+    jac, source = traced.coefficients(at, 0, params=problem.params, slots=None if traced.linear else value[:, None])
     jac = np.broadcast_to(np.asarray(jac)[:, :, 0], (*np.shape(jac)[:2], len(at)))
     if not traced.linear:
         return np.asarray(source)[:, 0], jac, value
