@@ -46,13 +46,7 @@ def information_travels(disc: Discretization, coefficients: Any, most: float = 2
         return True
     if jac is None:
         return False
-    symbol = np.zeros((jac.shape[-1], rec.dim, rec.dim))
-    for s, (_, b) in enumerate(rec.slots):
-        if sum(b) == 2:
-            i, j = [axis for axis in range(rec.dim) for _ in range(b[axis])]
-            symbol[:, i, j] += jac[0, s, 0] / 2
-            symbol[:, j, i] += jac[0, s, 0] / 2
-    values = np.linalg.eigvalsh(symbol)
+    values = _diffusivities(rec, jac)
     diffusion = np.abs(values).max(axis=1)
     if _all_told(disc, (values[:, 0] * values[:, -1] < -1e-10 * diffusion**2).any()).any():
         return True
@@ -65,6 +59,33 @@ def information_travels(disc: Discretization, coefficients: Any, most: float = 2
         return bool(np.median(convective) > most)
     above, below = _all_told(disc, (convective > most).sum(), (convective <= most).sum())
     return bool(above > below)
+
+
+def _diffusivities(rec: Recursion, jac: np.ndarray) -> np.ndarray:
+    """The eigenvalues (n, D), ascending, of the second derivatives' coefficients."""
+    symbol = np.zeros((jac.shape[-1], rec.dim, rec.dim))
+    for s, (_, b) in enumerate(rec.slots):
+        if sum(b) == 2:
+            i, j = [axis for axis in range(rec.dim) for _ in range(b[axis])]
+            symbol[:, i, j] += jac[0, s, 0] / 2
+            symbol[:, j, i] += jac[0, s, 0] / 2
+    return np.linalg.eigvalsh(symbol)
+
+
+def turned(disc: Discretization, nums: Numbers) -> np.ndarray:
+    """The particles, the fewer, at which the highest derivatives have the other sign than at the rest.
+
+    In between they have no weight, and what holds of the solution on one side need not on the other.
+    """
+    rec, jac = disc.rec, np.asarray(nums.jac)
+    if rec.fields > 1 or jac.shape[-1] == 1 or rec.dim > 1 and set(rec.orders) != {2}:
+        return np.zeros(0, int)
+    if rec.dim == 1:
+        values = jac[0, [s for s, (_, b) in enumerate(rec.slots) if sum(b) == max(rec.orders)], 0].T
+    else:
+        values = _diffusivities(rec, jac)
+    above, below = nums.ids[(values > 0).all(axis=1)], nums.ids[(values < 0).all(axis=1)]
+    return min(above, below, key=len)
 
 
 def _all_told(disc: Discretization, *counts: Any) -> np.ndarray:

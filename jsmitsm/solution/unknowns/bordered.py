@@ -218,7 +218,7 @@ class BorderedRegionsRun(Bordered, RegionsRun):
         return RegionsFit(self.at(unknowns, values), self.disc.cloud, whole_table(self.disc), taylor, recipe)
 
     def plain(self) -> Run:
-        return RegionsRun(self.disc, self.solver, True, self.repair)
+        return RegionsRun(self.disc, self.solver, True, self.repair, self.form)
 
 
 def _alone(nums: Numbers, source: Any) -> Numbers:
