@@ -200,7 +200,7 @@ class Rounds:
         """Whether the tolerance is reached, all doubts heard."""
         if not found.error <= self.tol:
             return False
-        self._checked(sol, cloud, spacing)
+        self._checked(sol, found, cloud, spacing)
         self.flags = sol.flags
         apart = gaps(sol) if self.quantity is None and self.norm == "max" and sol.defects else None
         self.apart = None
@@ -209,11 +209,14 @@ class Rounds:
         self.reached = self.error <= self.tol and not self.flags and self.apart is None
         return self.reached
 
-    def _checked(self, sol: Solution, cloud: Cloud, spacing: SpacingField) -> None:
-        """The distance to a solve of another order: where it is larger than the estimate, that is the error.
+    def _checked(self, sol: Solution, found: Measured, cloud: Cloud, spacing: SpacingField) -> None:
+        """Where the solution of another order is farther away than the tolerance, that is the error.
 
-        Unless it is the error of the other, which where a solution is barely resolved may be the larger one.
+        Unless it is the error of the other, which where a solution is barely resolved may be the larger one. The
+        estimate of a linear problem has met the other already.
         """
+        if found.apart <= self.tol:
+            return
         try:
             other = self._solve(cloud, sol.order + 2, None if sol.iterations == 1 else np.asarray(sol.u))
         except (ValueError, SolveError) as error:
@@ -227,13 +230,10 @@ class Rounds:
         else:
             number, again = self.number or 0.0, float(np.asarray(self.quantity(other)).sum())
             apart = abs(again - number) / (abs(number) or 1.0)
-        if apart <= self.error:
-            return
-        if apart > self.tol:
+        if apart > max(self.error, self.tol):
             own = measured(other, h, self._operator_order(other), self.norm, self.quantity).error
-            if np.isfinite(own) and own > _OTHERS * apart:
-                return
-        self.error = apart
+            if not (np.isfinite(own) and own > _OTHERS * apart):
+                self.error = apart
 
     def _stalled(self) -> bool:
         errors = [row[2] for row in self.rows]

@@ -24,6 +24,7 @@ from jsmitsm.runtime.errors import SolveError
 from jsmitsm.runtime.progress import bar
 from jsmitsm.runtime.tracers import concrete, is_traced
 from jsmitsm.solution.arguments import discretized
+from jsmitsm.solution.between import unseen
 from jsmitsm.solution.fit import Fit
 from jsmitsm.solution.flags import share
 from jsmitsm.solution.run import Run
@@ -44,15 +45,28 @@ class Correction:
     """What an estimate knows besides the size of the error.
 
     error (N, F): the estimated u_exact - u, with its sign.
+    towards (N, F): what leads to the solution of the other order, of which the error may be a part.
     made: the defect (N, F), for ``defect``; None for the methods other than S, which have none.
+    between: for ``missed``, None where there is no source that rows could miss.
     adjoint: of weights (N, F) of the values in a number, those of the defects in it; None where there are no rows.
     units (F,): what the fields are multiplied with to be compared with one another.
     """
 
     error: Any
+    towards: Any
     made: Callable[[], Any] | None
     adjoint: Callable[[np.ndarray], np.ndarray] | None
     units: Any = 1.0
+    between: Callable[[], Any] | None = None
+
+    @cached_property
+    def missed(self) -> tuple[Any, Any] | None:
+        """What the source makes of u where its Taylor series do not tell it between the particles, and the defect.
+
+        (N, F) each; rows of all orders miss it alike, and so does the distance of their solutions. None where the
+        source is constant, or the equation nonlinear.
+        """
+        return None if self.between is None else self.between()
 
     @cached_property
     def defect(self) -> Any:
@@ -65,8 +79,10 @@ class Correction:
 
 
 @bar("error estimate", parts=(("local fits", 3.0), ("unknowns", 1.0)))
-def correction(fit: Fit, values: Any) -> Correction:
+def correction(fit: Fit, values: Any, known: tuple[list[Class], list[Row]] | None = None) -> Correction:
     """The estimated error of the values (N, F), and what it comes from.
+
+    known: the classes and rows of the solve, where they are still there.
 
     The defect of the solution in rows of order p + 2, taken through the inverse of their matrix,
 
@@ -92,7 +108,7 @@ def correction(fit: Fit, values: Any) -> Correction:
     trust = _trust(high, *high_rows)
     free = np.flatnonzero(~low.held.reshape(-1))
     run = Run(low, fit.problem, "auto", True, False, "loo")
-    own = cache(lambda: all_rows(low, numbers(low, fit.problem, fit.taylor)))
+    own = cache(lambda: known or all_rows(low, numbers(low, fit.problem, fit.taylor)))
 
     def defect() -> Any:
         return _one_scale(_weights(low, *own()), _weights(high, *high_rows), low) * trust * residual
@@ -106,14 +122,21 @@ def correction(fit: Fit, values: Any) -> Correction:
         right = np.concatenate([weights.reshape(-1)[free], np.zeros(len(low.floating))])
         return spread(run.factor_of(*matrix(low, *own())).solve(right, transpose=True)[: len(free)])
 
+    def between() -> Any:
+        defect = unseen(low, numbers(low, fit.problem, fit.taylor), fit.problem, own())
+        if defect is None:
+            return None
+        right = np.concatenate([defect.reshape(-1)[free], np.zeros(len(low.floating))])
+        return spread(run.factor_of(*matrix(low, *own())).solve(right)[: len(free)]), defect
+
     try:
         x, _ = above.solved(*entries, residual.reshape(-1)[free], balanced=False)
     except SolveError:
         x, _ = run.solved(*matrix(low, *own()), defect().reshape(-1)[free], balanced=False)
-    error = spread(x)
+    error = towards = spread(x)
     if order > fit.recipe.order >= HIGH and not is_traced(error, trust) and trust.min(initial=1.0) < TRUSTED:
         error = _doubted(fit, low, values, error)
-    return Correction(error, defect, adjoint, comparable(high, high_nums))
+    return Correction(error, towards, defect, adjoint, comparable(high, high_nums), between)
 
 
 def _one_scale(mine: Any, theirs: Any, disc: Discretization) -> Any:
@@ -153,13 +176,14 @@ def _against(fit: Fit, low: Discretization, values: Any) -> Correction:
     order = _beside(fit, low)
     error, units = _towards(fit, low, values, order)
     if fit.recipe.formulation != "lsq" or is_traced(error):
-        return Correction(error, None, None, units)
+        return Correction(error, error, None, None, units)
 
     def missed() -> Any:
         nums = numbers(low, fit.problem, fit.taylor)
         return _put(np.zeros(low.held.shape), nums.ids, np.asarray(misfit(low, nums, values))[:, None])
 
-    return Correction(error if order < fit.recipe.order else _doubted(fit, low, values, error), missed, None, units)
+    doubted = error if order < fit.recipe.order else _doubted(fit, low, values, error)
+    return Correction(doubted, error, missed, None, units)
 
 
 def _towards(fit: Fit, low: Discretization, values: Any, order: int) -> tuple[Any, Any]:
