@@ -23,13 +23,15 @@ Quantity = Callable[[Solution], Any]
 class Measured:
     """error: relative, in the measure of the tolerance; infinite where there is none. contribution (N,): of every
     particle to it, in a scale of their own. scale: the largest |u|. apart: the distance to the solution of another
-    order, infinite where that is not known to the last. number: of the quantity, if there is one."""
+    order, infinite where that is not known to the last. number: of the quantity, if there is one. gathered: the error
+    that contributions (N,) of random signs make, in the scale of theirs; None where that is not known."""
 
     error: float
     contribution: np.ndarray
     scale: float
     apart: float = np.inf
     number: float | None = None
+    gathered: Callable[[np.ndarray], float] | None = None
 
 
 def measured(sol: Solution, spacing: np.ndarray, order: int, norm: str, quantity: Quantity | None) -> Measured:
@@ -56,7 +58,8 @@ def measured(sol: Solution, spacing: np.ndarray, order: int, norm: str, quantity
     if quantity is None:
         # A step of Newton's method leads to another order but about.
         exact = sol.iterations == 1 and sol.defects
-        return Measured(relative, contribution, scale, of(found.towards) if exact else np.inf)
+        apart = of(found.towards) if exact else np.inf
+        return Measured(relative, contribution, scale, apart, gathered=_gathering(found, far, defect.shape, norm))
     number, weights = _weights(sol, quantity)
     if weights is None:  # nothing differentiable: the whole solution stands for the number
         return Measured(relative, contribution, scale, number=number)
@@ -66,6 +69,18 @@ def measured(sol: Solution, spacing: np.ndarray, order: int, norm: str, quantity
     if found.adjoint is not None:
         contribution = np.abs(found.adjoint(weights) * defect).max(axis=1)
     return Measured(away / (abs(number) or scale or 1.0), contribution, scale, number=number)
+
+
+def _gathering(found: Correction, far: Any, shape: tuple[int, ...], norm: str) -> Callable[[np.ndarray], float] | None:
+    """Defects of random signs taken through the inverse: from one place to another they fade, or add up."""
+    if found.through is None or norm != "max":
+        return None
+    signs = np.random.default_rng(0).choice([-1.0, 1.0], shape)
+
+    def gathered(contribution: np.ndarray) -> float:
+        return float(np.abs(found.through((contribution / far)[:, None] * signs)).max(initial=0.0))
+
+    return gathered
 
 
 def _corrected(sol: Solution) -> Correction:

@@ -247,7 +247,7 @@ class Rounds:
     def _next(self, found: Measured, cloud: Cloud, spacing: SpacingField) -> tuple[SpacingField, Cloud] | None:
         points, h = np.asarray(cloud.points), spacing(np.asarray(cloud.points))
         power = self.solution.order + 1.0 + min(0, cloud.dim - self._operator_order(self.solution))
-        trusted = len(self.rows) > 1 and self.rows[-2][1] == self.rows[-1][1] and np.isfinite(found.error)
+        trusted = len(self.rows) > 1 and np.isfinite(found.error)
         contribution, error = found.contribution, self.error if np.isfinite(self.error) else 1e3
         apart, self.apart = self.apart, None
         here = marks(points, h, contribution, power, self.before if trusted else None)
@@ -257,7 +257,7 @@ class Rounds:
             return None
         most = min(max(_GROWTH * len(cloud), _SMALL[cloud.dim]), self.max_particles)
         wanted = _EASED * self.tol if apart is not None else self.tol if error > self.tol else 0.5 * error
-        made_h, _ = next_spacing(here, power, error, wanted, most)
+        made_h, _ = next_spacing(here, power, error, wanted, most, found.gathered)
         if apart is not None:
             parted = marks(points, h, apart, power, None, _PARTED)
             finer, _ = next_spacing(parted, power, float(apart.max()) / found.scale / _GAP, self.tol, most)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
 from typing import Any
 
 import jax.numpy as jnp
@@ -49,6 +49,7 @@ class Correction:
     made: the defect (N, F), for ``defect``; None for the methods other than S, which have none.
     between: for ``missed``, None where there is no source that rows could miss.
     adjoint: of weights (N, F) of the values in a number, those of the defects in it; None where there are no rows.
+    through: of defects (N, F) what they make of u; None where there are no rows.
     units (F,): what the fields are multiplied with to be compared with one another.
     """
 
@@ -57,6 +58,7 @@ class Correction:
     made: Callable[[], Any] | None
     adjoint: Callable[[np.ndarray], np.ndarray] | None
     units: Any = 1.0
+    through: Callable[[np.ndarray], np.ndarray] | None = None
     between: Callable[[], Any] | None = None
 
     @cached_property
@@ -118,16 +120,15 @@ def correction(fit: Fit, values: Any, known: tuple[list[Class], list[Row]] | Non
         every: Any = jnp.asarray(zero).at[free].set(x) if is_traced(x) else _put(zero, free, x)
         return every.reshape(low.held.shape)
 
-    def adjoint(weights: np.ndarray) -> np.ndarray:
-        right = np.concatenate([weights.reshape(-1)[free], np.zeros(len(low.floating))])
-        return spread(run.factor_of(*matrix(low, *own())).solve(right, transpose=True)[: len(free)])
+    def through(defects: np.ndarray, transpose: bool = False) -> np.ndarray:
+        right = np.concatenate([defects.reshape(-1)[free], np.zeros(len(low.floating))])
+        return spread(run.factor_of(*matrix(low, *own())).solve(right, transpose=transpose)[: len(free)])
 
     def between() -> Any:
         defect = unseen(low, numbers(low, fit.problem, fit.taylor), fit.problem, own())
         if defect is None:
             return None
-        right = np.concatenate([defect.reshape(-1)[free], np.zeros(len(low.floating))])
-        return spread(run.factor_of(*matrix(low, *own())).solve(right)[: len(free)]), defect
+        return through(defect), defect
 
     try:
         x, _ = above.solved(*entries, residual.reshape(-1)[free], balanced=False)
@@ -136,7 +137,8 @@ def correction(fit: Fit, values: Any, known: tuple[list[Class], list[Row]] | Non
     error = towards = spread(x)
     if order > fit.recipe.order >= HIGH and not is_traced(error, trust) and trust.min(initial=1.0) < TRUSTED:
         error = _doubted(fit, low, values, error)
-    return Correction(error, towards, defect, adjoint, comparable(high, high_nums), between)
+    turned = partial(through, transpose=True)
+    return Correction(error, towards, defect, turned, comparable(high, high_nums), through, between)
 
 
 def _one_scale(mine: Any, theirs: Any, disc: Discretization) -> Any:
