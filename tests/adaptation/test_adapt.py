@@ -9,7 +9,7 @@ import jsmitsm as js
 from jsmitsm.adaptation.data import data_of, unresolved
 from jsmitsm.adaptation.first_cloud import first_cloud
 from jsmitsm.adaptation.layers import layers
-from jsmitsm.adaptation.marking import Marks, next_spacing
+from jsmitsm.adaptation.marking import Marks, marks, next_spacing
 from jsmitsm.adaptation.spacing_field import GROWTH, SpacingField
 
 CORNER = [(0, 0), (1, 0), (1, 1), (-1, 1), (-1, -1), (0, -1)]
@@ -162,23 +162,49 @@ def test_a_spacing_field_grows_no_faster_than_it_may():
     assert field(np.array([[9.0, 9.0]])) <= 0.2
 
 
+def marked(points, eta):
+    none = np.zeros(len(points), bool)
+    return Marks(points, np.full(len(points), 0.01), eta, np.full(len(points), 5.0), none, none)
+
+
 def test_contributions_are_made_equal():
     """Of two halves whose contributions differ by 2^5, at a rate of 5 the worse one gets half the spacing."""
     points = np.linspace(0.0, 1.0, 100)[:, None]
     eta = np.where(points[:, 0] < 0.5, 1.0, 2.0**-5)
-    marks = Marks(points, np.full(100, 0.01), eta, np.full(100, 5.0), np.zeros(100, bool))
-    made, count = next_spacing(marks, 5.0, 1e-1, 2e-3, 100_000)
+    found = marked(points, eta)
+    made, count = next_spacing(found, 5.0, 1e-1, 2e-3, 100_000)
     assert made[0] < made[-1]
     assert made[-1] / made[0] == pytest.approx(2.0, rel=1e-6)
-    assert next_spacing(marks, 5.0, 1e-2, 1e-12, 150)[1] <= 150
+    assert next_spacing(found, 5.0, 1e-2, 1e-12, 150)[1] <= 150
 
 
 def test_near_the_tolerance_no_spacing_grows():
-    """What was coarsened there had to be refined again, round after round."""
-    eta = np.where(np.arange(100) < 50, 1.0, 1e-9)
-    marks = Marks(np.linspace(0.0, 1.0, 100)[:, None], np.full(100, 0.01), eta, np.full(100, 5.0), np.zeros(100, bool))
-    assert next_spacing(marks, 5.0, 5e-3, 2e-3, 100_000)[0].max() == pytest.approx(0.01)
-    assert next_spacing(marks, 5.0, 1e-1, 2e-3, 100_000)[0].max() > 0.013
+    """What was coarsened there had to be refined again, round after round; but for what is no matter at all."""
+    points = np.linspace(0.0, 1.0, 100)[:, None]
+    found = marked(points, np.where(np.arange(100) < 50, 1.0, 1e-2))
+    assert next_spacing(found, 5.0, 5e-3, 2e-3, 100_000)[0].max() == pytest.approx(0.01)
+    assert next_spacing(found, 5.0, 1e-1, 2e-2, 100_000)[0].max() > 0.013
+    found = marked(points, np.where(np.arange(100) < 50, 1.0, 1e-9))
+    assert next_spacing(found, 5.0, 5e-3, 2e-3, 100_000)[0].max() > 0.013
+
+
+def test_a_singular_point_found_twice_is_refined_by_far():
+    """Contributions h^(2/3) about 0, on spacings that grow from it; those beside it are left to the gradation."""
+    away = np.cumsum(0.1 * 1.1 ** np.arange(40))
+    points = np.concatenate([-away[::-1], [0.0], away])[:, None] + 1e-3
+
+    def round_of(tip, before):
+        eta = np.where(np.abs(points[:, 0]) < 0.05, tip ** (2 / 3), 1e-9)
+        return marks(points, tip + np.abs(points[:, 0] - 1e-3) / 4, eta, 9.0, before)
+
+    first = round_of(0.1, None)
+    assert not first.singular.any()  # nobody knows a rate yet
+    second = round_of(0.03, first)
+    assert np.flatnonzero(second.singular).tolist() == [40] and not second.located.any()
+    third = round_of(0.0015, second)
+    assert np.flatnonzero(third.located).tolist() == [40]
+    made, _ = next_spacing(third, 9.0, 1e-2, 1e-7, 100_000)
+    assert made[40] < 0.05 * third.spacing[40]
 
 
 def test_rounds_do_not_undo_each_other():
