@@ -128,6 +128,27 @@ def test_a_peak_between_the_particles_is_seen():
     assert np.linalg.norm(finest - [0.51, 0.117], axis=1).max() < 0.02
 
 
+def test_a_layer_within_a_line_is_told_by_the_drift():
+    """eps u'' + x u' = 0 turns within sqrt(eps) about 0; with the other sign its layers are at the ends."""
+    for sign, finest in ((1.0, 1e-3), (-1.0, 0.1)):
+        problem = js.Problem(lambda u, x: 1e-6 * js.laplacian(u)(x) + sign * x[0] * js.grad(u)(x)[0], ends(-1.0, 1.0))  # noqa: B023
+        points, width = unresolved(data_of(problem, 1, 4), js.interval(-1.0, 1.0, 21), 0.1, 0.05, 1.0, 10_000)
+        assert finest / 2 < width.min(initial=0.1) < 2 * finest
+        assert sign < 0 or abs(points[np.argmin(width), 0]) < 2 * finest
+
+
+def test_a_kink_of_the_source_is_in_the_error():
+    """u'' jumps at 0.3, between particles: rows of two orders miss it by the same, and their distance tells nothing."""
+    bent = lambda x: jnp.sign(x[0] - 0.3) * (x[0] - 0.3) ** 2 / 2
+    source = lambda x: jnp.where(x[0] > 0.3, 1.0, -1.0)
+    problem = js.Problem(lambda u, x: js.laplacian(u)(x) - source(x), ends(-0.045, 0.245))
+    found = js.adapt(problem, line, 1e-3, max_rounds=1)
+    assert found.error < 5 * true_error(found, bent) and true_error(found, bent) < 3 * found.error
+    exact = js.Problem(lambda u, x: js.laplacian(u)(x) - jnp.sin(40.0 * x[0]), ends(0.0, 0.0))
+    smooth = js.solve(exact, js.interval(0.0, 1.0, 15)).correction()  # resolved by what rows know of it
+    assert np.abs(smooth.missed[0]).max() < np.abs(smooth.error).max()
+
+
 def test_a_smooth_source_asks_for_nothing():
     problem = js.Problem(lambda u, x: js.laplacian(u)(x) - jnp.exp(x[0] * x[1]), {"boundary": js.dirichlet(0.0)})
     points, _ = unresolved(data_of(problem, 2, 4), js.from_polygon(SQUARE, 0.1), 0.1, 0.05, 1.0, 100_000)
