@@ -27,7 +27,7 @@ DATA = Path(__file__).parent / "data" / "adaptation.json"
 
 
 def true_error(case: Case, found: js.Adapted) -> float:
-    """The largest error at the particles over the largest value, or that of the number, as the tolerance measures it."""
+    """The largest error at the particles over the largest value, or that of the number: what the tolerance is on."""
     if case.number is not None:
         assert found.quantity is not None
         return abs(found.quantity - case.number) / abs(case.number)

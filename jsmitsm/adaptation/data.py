@@ -37,7 +37,8 @@ class Look(NamedTuple):
     """How far source and coefficients are from their Taylor polynomials about n points.
 
     source (n,): of the source over the leading coefficient, that is of m-th derivatives of u. coefficient (n,): in
-    parts of the operator's largest term. wave (n,): (k h)^2, or (h / w)^2 of a layer of the width w. size (n,): of the source around.
+    parts of the operator's largest term. wave (n,): (k h)^2, or (h / w)^2 of a layer of the width w. size (n,): of the
+    source around.
     """
 
     source: np.ndarray

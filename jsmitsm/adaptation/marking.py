@@ -13,8 +13,8 @@ from jsmitsm.adaptation.spacing_field import GROWTH
 # The error aimed at, in parts of the tolerance: what is predicted is not always met.
 SAFETY = 0.4
 # A spacing changes by at most these factors in a round: refined where the solution is smooth, where it is known not to
-# be, by more where that was found at the same point before; and coarsened: freely where the error says nothing yet, later gently, and not at all within some factor of what is
-# wanted, or rounds would undo each other.
+# be, and where that was found at the same point before; and coarsened: freely where the error says nothing yet, later
+# gently, and not at all within some factor of what is wanted, or rounds would undo each other.
 FINER, SINGULAR, LOCATED, COARSER, GENTLY, FAR = 0.3, 0.05, 1e-3, 3.0, 1.4, 3.0
 # Contributions below this part of what they may be are no matter.
 _NOTHING = 1e-4
@@ -59,8 +59,9 @@ def marks(
 ) -> Marks:  # fmt: skip
     """Contributions smoothed, and the rates at which they fall with the spacing.
 
-    power: that of a smooth solution. before: those of the round before, None where it had another order or was
-    not trustworthy; then all fall at the rate ``expected``, that of a smooth solution if None.
+    power: that of a smooth solution. before: those of the round before, None where it was not trustworthy; then all
+    fall at the rate ``expected``, that of a smooth solution if None. Had it another order, contributions of a smooth
+    solution fell by more than the spacing tells, and others by as much.
     """
     near = cKDTree(points).query(points, k=range(1, min(_WORST, len(points)) + 1))[1]
     largest = contribution[near[:, :_NEAR]].max(axis=1)
@@ -129,13 +130,14 @@ def next_spacing(
     aim = SAFETY * wanted / max(error, 1e-300) * max(float(eta.max()), now)
     rate = np.where(found.singular, found.rate, np.maximum(found.rate, _ROUGH * power))
     lowest = np.where(found.located, LOCATED, np.where(found.singular, SINGULAR, FINER))
-    shaded = _reached(found.points, found.spacing, found.singular, _REACH)
+    shaded = _reached(found.points, found.spacing, found.located, _REACH)
     goal, count = aim, float(len(eta))
     coarser = COARSER if error > ROUGH else GENTLY if error > FAR * wanted else 1.0
     for _ in range(200):
         highest = np.where(eta < _NOTHING * goal, COARSER, coarser)
         factor = np.clip((goal / eta) ** (1.0 / rate), lowest, highest)
-        factor = np.where(shaded & (factor[found.singular].min(initial=1.0) < FINER), np.maximum(factor, 1.0), factor)
+        if factor[found.located].min(initial=1.0) < FINER:
+            factor = np.where(shaded, np.maximum(factor, 1.0), factor)  # the gradation refines these
         count = float(_children(factor, dim).sum())
         more = np.sqrt(np.sum(volume * np.minimum(factor, 1.0) ** -dim) / np.sum(volume))
         if count > most:

@@ -287,7 +287,6 @@ class Rounds:
             return None
         return field, following
 
-
     def _better(self, spacing: SpacingField) -> SpacingField | None:
         """The spacing of a round before that did better than the last one, over which no other may grow then."""
         order, error = self.rows[-1][1:3]
