@@ -30,6 +30,8 @@ _FRESH, _BESIDE = 0.15, 3.0
 _NEAR, _WORST, _HELD = 8, 12, 4
 # Rows reach so many spacings far, about, and the error that a singular point makes.
 _REACH, _AFFECTED = 4.0, 25.0
+# Of a line of them there are at least so many within so many spacings.
+_ALONG, _FEW = 12.0, 5
 # Within so many spacings a singular point is the one of the round before.
 _SAME = 1.0
 # The error is at least the largest contribution, and random signs of many add up to this part of their root sum
@@ -112,6 +114,16 @@ def _reached(points: np.ndarray, spacing: np.ndarray, some: np.ndarray, reach: f
     return ~some & (away < reach * spacing[some][near])
 
 
+def _alone(found: Marks) -> np.ndarray:
+    """The singular points (N,) that are no part of a line of them."""
+    at = np.flatnonzero(found.singular)
+    alone = np.zeros(len(found.points), bool)
+    if len(at):
+        tree = cKDTree(found.points[at])
+        alone[at] = tree.query_ball_point(tree.data, _ALONG * found.spacing[at], return_length=True) < _FEW
+    return alone
+
+
 def next_spacing(
     found: Marks, power: float, error: float, wanted: float, most: float, gathered: Gathered | None = None
 ) -> tuple[np.ndarray, float]:
@@ -130,13 +142,14 @@ def next_spacing(
     aim = SAFETY * wanted / max(error, 1e-300) * max(float(eta.max()), now)
     rate = np.where(found.singular, found.rate, np.maximum(found.rate, _ROUGH * power))
     lowest = np.where(found.located, LOCATED, np.where(found.singular, SINGULAR, FINER))
-    shaded = _reached(found.points, found.spacing, found.located, _REACH)
+    alone = found.located | _alone(found)
+    shaded = _reached(found.points, found.spacing, alone, _REACH)
     goal, count = aim, float(len(eta))
     coarser = COARSER if error > ROUGH else GENTLY if error > FAR * wanted else 1.0
     for _ in range(200):
         highest = np.where(eta < _NOTHING * goal, COARSER, coarser)
         factor = np.clip((goal / eta) ** (1.0 / rate), lowest, highest)
-        if factor[found.located].min(initial=1.0) < FINER:
+        if factor[alone].min(initial=1.0) < FINER:
             factor = np.where(shaded, np.maximum(factor, 1.0), factor)  # the gradation refines these
         count = float(_children(factor, dim).sum())
         more = np.sqrt(np.sum(volume * np.minimum(factor, 1.0) ** -dim) / np.sum(volume))

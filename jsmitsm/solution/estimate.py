@@ -81,10 +81,10 @@ class Correction:
 
 
 @bar("error estimate", parts=(("local fits", 3.0), ("unknowns", 1.0)))
-def correction(fit: Fit, values: Any, known: tuple[list[Class], list[Row]] | None = None) -> Correction:
+def correction(fit: Fit, values: Any, made: Run | None = None) -> Correction:
     """The estimated error of the values (N, F), and what it comes from.
 
-    known: the classes and rows of the solve, where they are still there.
+    made: the run of the solve, where its numbers and rows are still there.
 
     The defect of the solution in rows of order p + 2, taken through the inverse of their matrix,
 
@@ -110,7 +110,9 @@ def correction(fit: Fit, values: Any, known: tuple[list[Class], list[Row]] | Non
     trust = _trust(high, *high_rows)
     free = np.flatnonzero(~low.held.reshape(-1))
     run = Run(low, fit.problem, "auto", True, False, "loo")
-    own = cache(lambda: known or all_rows(low, numbers(low, fit.problem, fit.taylor)))
+    kept = made is not None and made.rows is not None and made.nums is not None
+    nums = cache(lambda: made.nums if kept else numbers(low, fit.problem, fit.taylor))
+    own = cache(lambda: made.rows if kept else all_rows(low, nums()))
 
     def defect() -> Any:
         return _one_scale(_weights(low, *own()), _weights(high, *high_rows), low) * trust * residual
@@ -125,7 +127,7 @@ def correction(fit: Fit, values: Any, known: tuple[list[Class], list[Row]] | Non
         return spread(run.factor_of(*matrix(low, *own())).solve(right, transpose=transpose)[: len(free)])
 
     def between() -> Any:
-        defect = unseen(low, numbers(low, fit.problem, fit.taylor), fit.problem, own())
+        defect = unseen(low, nums(), fit.problem, own())
         if defect is None:
             return None
         return through(defect), defect

@@ -18,6 +18,7 @@ from jsmitsm.solution.anywhere import Anywhere
 from jsmitsm.solution.estimate import Correction, correction
 from jsmitsm.solution.fit import Recipe
 from jsmitsm.solution.flags import NOTHING, SQUARED, share
+from jsmitsm.solution.run import Run
 
 # An estimated error above this part of the solution is a flag.
 LARGE = 0.02
@@ -151,7 +152,7 @@ class Solution(Anywhere):
 
     def _corrected(self) -> Correction:
         """The estimate, with the rows of the solve where they are still there."""
-        return correction(self._fit, self._values, getattr(self._report, "rows", None))
+        return correction(self._fit, self._values, self._report if isinstance(self._report, Run) else None)
 
     def _size(self, found: Correction) -> Array:
         """The size of an estimated error, kept for the next who asks."""
