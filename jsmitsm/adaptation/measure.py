@@ -73,12 +73,13 @@ def measured(sol: Solution, spacing: np.ndarray, order: int, norm: str, quantity
 
 def _gathering(found: Correction, far: Any, shape: tuple[int, ...], norm: str) -> Callable[[np.ndarray], float] | None:
     """Defects of random signs taken through the inverse: from one place to another they fade, or add up."""
-    if found.through is None or norm != "max":
+    through = found.through
+    if through is None or norm != "max":
         return None
     signs = np.random.default_rng(0).choice([-1.0, 1.0], shape)
 
     def gathered(contribution: np.ndarray) -> float:
-        return float(np.abs(found.through((contribution / far)[:, None] * signs)).max(initial=0.0))
+        return float(np.abs(through((contribution / far)[:, None] * signs)).max(initial=0.0))
 
     return gathered
 

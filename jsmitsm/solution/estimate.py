@@ -110,9 +110,14 @@ def correction(fit: Fit, values: Any, made: Run | None = None) -> Correction:
     trust = _trust(high, *high_rows)
     free = np.flatnonzero(~low.held.reshape(-1))
     run = Run(low, fit.problem, "auto", True, False, "loo")
-    kept = made is not None and made.rows is not None and made.nums is not None
-    nums = cache(lambda: made.nums if kept else numbers(low, fit.problem, fit.taylor))
-    own = cache(lambda: made.rows if kept else all_rows(low, nums()))
+
+    @cache
+    def nums() -> Numbers:
+        return numbers(low, fit.problem, fit.taylor) if made is None or made.nums is None else made.nums
+
+    @cache
+    def own() -> tuple[list[Class], list[Row]]:
+        return all_rows(low, nums()) if made is None or made.rows is None else made.rows
 
     def defect() -> Any:
         return _one_scale(_weights(low, *own()), _weights(high, *high_rows), low) * trust * residual
