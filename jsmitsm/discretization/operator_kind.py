@@ -19,7 +19,7 @@ def prefers_least_squares(disc: Discretization, nums: Numbers) -> bool:
     fits agree. Measured on Stokes' flow, orders 4 and 6, random and even particles: velocities 10 to 80 times as
     accurate, pressures 10 to 20; of Navier's and Stokes' equations 3 % where predicted values are 40 % off.
     """
-    return disc.scheme.method == "S" and (saddle(disc.rec) or information_travels(disc, nums))
+    return disc.scheme.method == "S" and (saddle(disc.rec) or information_travels(disc, nums.jac))
 
 
 def saddle(rec: Recursion) -> bool:
@@ -27,13 +27,13 @@ def saddle(rec: Recursion) -> bool:
     return any(rec.weights)
 
 
-def information_travels(disc: Discretization, nums: Numbers) -> bool:
+def information_travels(disc: Discretization, coefficients: Any) -> bool:
     """Whether information travels: operators of first order, hyperbolic and parabolic ones of second,
     and those whose convection outweighs diffusion between neighbours (cell Peclet number above 2).
 
-    There a value predicted by neighbours on all sides is the wrong global form.
+    There a value predicted by neighbours on all sides is the wrong global form. coefficients: as ``Numbers.jac``.
     """
-    rec, jac = disc.rec, concrete(nums.jac)
+    rec, jac = disc.rec, concrete(coefficients)
     jac = None if jac is None else np.asarray(jac)  # where it only carries derivatives, no operation is recorded
     orders = set(rec.orders)
     if disc.scheme.method != "S" or rec.fields > 1:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -269,8 +268,7 @@ class Local:
         slots = None if taylor is None else slot_series(disc.rec, disc.traced.slots, taylor[ids], 0)
         points = np.asarray(disc.cloud.points)[ids]
         jac, _ = disc.traced.coefficients(points, 0, params=disc.problem.params, slots=slots)
-        leading: Any = SimpleNamespace(jac=jac)
-        if any(self.team.gather(information_travels(disc, leading))):
+        if any(self.team.gather(information_travels(disc, jac))):
             raise ValueError(
                 'formulation: in this equation information travels (first order, or convection above diffusion), and '
                 'the least-squares form is not made for several processes; say formulation="loo" where diffusion '

@@ -98,7 +98,7 @@ class RegionsRun(Run):
         for part, own in zip(self.disc.parts, nums.parts):
             if own.degenerate is not None and len(own.degenerate.empty):
                 self._fail_empty(part.ids[own.degenerate.empty])
-            if information_travels(part.disc, own):
+            if information_travels(part.disc, own.jac):
                 self.object(
                     f"Information travels in the equation of the region {part.name!r}, or is carried faster than it "
                     "spreads between neighbours; the form that suits it is not made for clouds of several regions: "
