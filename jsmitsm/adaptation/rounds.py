@@ -39,8 +39,8 @@ _EASED = 1.5
 _FULL = 0.8
 # So many solves in a row may fail, each followed by one on a finer cloud.
 _REFUSED = 4
-# A cloud grows at most by this factor, small ones by more; large ones, and those that made it worse, by the next where
-# so many attempts make it: around a point that is refined the gradation decides.
+# A cloud grows at most by this factor, small ones by more; large ones at least by the next, where so many attempts make
+# it: around a point that is refined the gradation decides.
 _GROWTH, _SMALL, _LEAST, _LARGE, _PUSHED = 5.0, {1: 400, 2: 1500, 3: 3000}, 1.5, 5000, 3
 # The look at source and coefficients, in parts of the largest |u|; degree of the polynomials it compares with.
 _PART, _DEGREE = 0.05, 4
@@ -267,7 +267,6 @@ class Rounds:
         better = self._better(spacing)
         if better is not None:
             field = better.joined(points, made_h)
-        small = apart is None and (len(cloud) > _LARGE or better is not None)
         for attempt in range(8):
             try:
                 following = self._cloud(field)
@@ -280,7 +279,7 @@ class Rounds:
                 continue
             if len(following) > self.max_particles:
                 field = field.scaled((1.1 * len(following) / self.max_particles) ** (1.0 / cloud.dim))
-            elif attempt < _PUSHED and small and len(following) < _LEAST * len(cloud):
+            elif attempt < _PUSHED and apart is None and len(cloud) > _LARGE and len(following) < _LEAST * len(cloud):
                 field = field.scaled((len(following) / (1.1 * _LEAST * len(cloud))) ** (1.0 / cloud.dim))
             else:
                 break
