@@ -26,7 +26,8 @@ class Case(NamedTuple):
     """A problem with its domain and the exact solution.
 
     operator: diffusion, wind and reaction (a function, None without one) of scalar problems other than Poisson's, for
-    who states it in another form; homogeneous: without a source.
+    who states it in another form; homogeneous: without a source. quantity, number: what the tolerance is on instead
+    of the solution, and its exact value.
     """
 
     name: str
@@ -36,6 +37,8 @@ class Case(NamedTuple):
     polygon: tuple[tuple[float, float], ...] | None = None
     operator: tuple[float, tuple[float, float], Any] | None = None
     homogeneous: bool = False
+    quantity: Callable[[js.Solution], Any] | None = None
+    number: float | None = None
 
 
 def _polygon(name: str, polygon: Any, exact: Any, pde: Any, fields: int = 1) -> Case:
@@ -206,6 +209,66 @@ def several() -> Case:
     )
 
 
+def point_value() -> Case:
+    """The corner of 3 pi / 2 again, for one value beside it."""
+    case, at = reentrant(1.5 * np.pi, "3 pi / 2"), np.array([-0.1, 0.1])
+    return case._replace(
+        name="value beside the corner", quantity=lambda sol: sol(at[None])[0], number=float(case.exact(jnp.asarray(at)))
+    )
+
+
+def capacitor(radius: float = 0.25, away: float = 0.4) -> Case:
+    """Two circles, one in the other: the flux between them is 2 pi / arcosh((1 + r^2 - d^2) / 2 r)."""
+    shape = js.sdf.difference(js.sdf.circle((0.0, 0.0), 1.0), js.sdf.circle((away, 0.0), radius))
+    inner = lambda x: np.hypot(x[:, 0] - away, x[:, 1]) < 1.2 * radius
+    groups = {"inner": inner, "outer": lambda x: ~inner(x)}
+    problem = js.Problem(lambda u, x: js.laplacian(u)(x), {"inner": js.dirichlet(1.0), "outer": js.dirichlet(0.0)})
+    number = 2 * np.pi / np.arccosh((1 + radius**2 - away**2) / (2 * radius))
+    make = lambda spacing: js.from_sdf(shape, ((-1.0, -1.0), (1.0, 1.0)), spacing, groups=groups)
+    return Case("flux between circles", problem, make, None, quantity=lambda sol: sol.flux("inner"), number=number)
+
+
+def kirsch() -> Case:
+    """A plate with a hole under tension: the stress beside the hole is three times that far away."""
+
+    def exact(x):  # both Lame constants are 1
+        r, t = jnp.hypot(*x), jnp.arctan2(x[1], x[0])
+        once, twice, sides = jnp.array([[3.0, -1.0]] * 2 + [[1.0, 1.0]])
+        c, c3 = jnp.stack([jnp.cos(t), jnp.sin(t)]), jnp.stack([jnp.cos(3 * t), jnp.sin(3 * t)])
+        return (r * once * c + 2 / r * (twice * c + sides * c3) - 2 / r**3 * c3) / 8
+
+    stress = lambda slope: jnp.trace(slope) * jnp.eye(2) + slope + slope.T
+    shape = js.sdf.difference(js.sdf.circle((0.0, 0.0), 3.0), js.sdf.circle((0.0, 0.0), 1.0))
+    near = lambda x: np.hypot(*x.T) < 2
+    groups = {"hole": near, "far": lambda x: ~near(x)}
+    free = js.condition(lambda u, x, n: stress(js.grad(u)(x)) @ n)
+    pde = lambda u, x: js.laplacian(u)(x) + 2 * js.grad(js.divergence(u))(x)
+    problem = js.Problem(pde, {"hole": free, "far": js.dirichlet(exact)}, fields=2)
+    make = lambda spacing: js.from_sdf(shape, ((-3.0, -3.0), (3.0, 3.0)), spacing, groups=groups)
+    beside = lambda sol: stress(sol.grad(np.array([[0.0, 1.0]]))[0])[0, 0]
+    return Case("stress beside a hole (Kirsch)", problem, make, exact, quantity=beside, number=3.0)
+
+
+def _solid(name: str, shape: Any, exact: Any, source: Any) -> Case:
+    problem = js.Problem(lambda u, x: js.laplacian(u)(x) - source(x), {"boundary": js.dirichlet(exact)})
+    make = lambda spacing: js.from_sdf(shape, ((-1.0,) * 3, (1.0,) * 3), spacing)
+    return Case(name, problem, make, exact)
+
+
+def fichera(a: float = 0.5) -> Case:
+    """|x|^a where one of eight cubes is missing."""
+    shape = js.sdf.difference(js.sdf.box((-1.0,) * 3, (1.0,) * 3), js.sdf.box((0.0,) * 3, (2.0,) * 3))
+    radius = lambda x: jnp.sqrt(jnp.where(x @ x > 0, x @ x, 1.0))
+    exact = lambda x: jnp.where(x @ x > 0, radius(x) ** a, 0.0)
+    return _solid("corner of a solid (Fichera)", shape, exact, lambda x: a * (a + 1) * radius(x) ** (a - 2))
+
+
+def edge() -> Case:
+    """The reentrant corner of 3 pi / 2, drawn out to an edge."""
+    shape = js.sdf.difference(js.sdf.box((-1.0,) * 3, (1.0,) * 3), js.sdf.box((0.0, -2.0, -2.0), (2.0, 0.0, 2.0)))
+    return _solid("edge of a solid", shape, reentrant(1.5 * np.pi, "").exact, lambda x: 0.0)
+
+
 CASES: dict[str, Callable[[], Case]] = {
     "analytic": analytic,
     "corner-180": lambda: reentrant(np.pi + 0.01, "pi + 0.01"),
@@ -226,5 +289,10 @@ CASES: dict[str, Callable[[], Case]] = {
     "front-well": lambda: front(50.0, (0.5, 0.5), 0.25, "well"),
     "interior-line": interior_line,
     "several": several,
+    "point": point_value,
+    "flux": capacitor,
+    "kirsch": kirsch,
+    "fichera": fichera,
+    "edge": edge,
 }
 LEFT_OUT = ("battery", "intersecting interfaces")

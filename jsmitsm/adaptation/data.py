@@ -25,7 +25,7 @@ SAMPLES = {1: 200000, 2: 20000, 3: 30000}
 _AWAY = 1.25
 # Coefficients may differ from their Taylor polynomials by this part of the largest term of the operator.
 COEFFICIENT = 0.3
-# Waves of an operator such as laplacian(u) + k^2 u: (k h)^2 up to this is resolved.
+# Waves of an operator such as laplacian(u) + k^2 u: (k h)^2 up to this is resolved, and a layer's (h / w)^2.
 _WAVE = 1.5
 # Of so many points it is asked whether they lie in the domain; of more, only whether in its box.
 _ASKED = 60_000
@@ -37,7 +37,8 @@ class Look(NamedTuple):
     """How far source and coefficients are from their Taylor polynomials about n points.
 
     source (n,): of the source over the leading coefficient, that is of m-th derivatives of u. coefficient (n,): in
-    parts of the operator's largest term. wave (n,): (k h)^2. size (n,): of the source around.
+    parts of the operator's largest term. wave (n,): (k h)^2, or (h / w)^2 of a layer of the width w. size (n,): of the
+    source around.
     """
 
     source: np.ndarray
@@ -100,7 +101,7 @@ class Data:
             away = np.abs(np.einsum("estm,tm->esm", jac[..., which], powers) - jac_there[:, :, 0]) * scale[..., which]
             terms = np.maximum((np.abs(jac[:, :, 0]) * scale).max(axis=1), 1e-300)
             coefficient = _gathered(away.max(axis=1) / terms[:, which], which, len(points))
-            wave = self._waves(jac[:, :, 0]) * length**2
+            wave = np.maximum(self._waves(jac[:, :, 0]), self._turning(jac, length)) * length**2
         size = np.where(np.isfinite(centre), np.maximum(size, centre), size)
         return Look(missed, coefficient, wave, size)
 
@@ -118,6 +119,16 @@ class Data:
         one_sign = second.min(axis=0) * second.max(axis=0) > 0
         diffusion = np.where(one_sign, second[0], 1.0)
         return np.where(one_sign, np.maximum(jac[0, zero[0]] / diffusion, 0.0), 0.0)
+
+    def _turning(self, jac: np.ndarray, length: np.ndarray) -> np.ndarray:
+        """1 / w^2 (n,) of layers within a line: about a zero of b that rises, a u'' + b u' has them, w^2 = a / b'."""
+        t = self.traced
+        found = np.zeros(jac.shape[-1])
+        if t.dim > 1 or t.n_equations > 1 or t.order != (2,) or (0, (1,)) not in t.slots:
+            return found
+        a, (b, slope) = jac[0, t.slots.index((0, (2,))), 0], jac[0, t.slots.index((0, (1,))), :2]
+        rise = slope / np.where(a != 0, a, np.inf)
+        return np.where(np.abs(b) <= np.abs(slope) * length, np.maximum(rise, 0.0), 0.0)
 
 
 def _gathered(values: np.ndarray, which: np.ndarray, n: int) -> np.ndarray:

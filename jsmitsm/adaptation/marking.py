@@ -2,41 +2,57 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from jsmitsm.adaptation.spacing_field import GROWTH
 
 # The error aimed at, in parts of the tolerance: what is predicted is not always met.
 SAFETY = 0.4
 # A spacing changes by at most these factors in a round: refined where the solution is smooth, where it is known not to
-# be, and coarsened: freely where the error says nothing yet, later gently, and not at all within some factor of what is
-# wanted, or rounds would undo each other.
-FINER, SINGULAR, COARSER, GENTLY, FAR = 0.3, 0.05, 3.0, 1.4, 3.0
+# be, and where that was found at the same point before; and coarsened: freely where the error says nothing yet, later
+# gently, and not at all within some factor of what is wanted, or rounds would undo each other.
+FINER, SINGULAR, LOCATED, COARSER, GENTLY, FAR = 0.3, 0.05, 1e-3, 3.0, 1.4, 3.0
+# Contributions below this part of what they may be are no matter.
+_NOTHING = 1e-4
 # Where refining helped with less than this part of the expected power, the solution is not smooth.
 _ROUGH = 0.6
 _SLOWEST = 0.35
 # Rates are read where the spacing changed by this factor, and smoothed over so many particles.
 _CHANGED, _AROUND = 1.3, 6
+# Where the spacing changed by this factor, only particles within so many spacings of an old one are compared with it.
+_FRESH, _BESIDE = 0.15, 3.0
 # Contributions are taken from the largest of so many nearest particles; a singular point is the worst of so many. It
 # may be one of its so many neighbours without an equation of its own, as at the corner of a domain.
 _NEAR, _WORST, _HELD = 8, 12, 4
-# The error is at least the largest contribution, and random signs of many add up to this part of their root sum square.
+# Rows reach so many spacings far, about, and the error that a singular point makes.
+_REACH, _AFFECTED = 4.0, 25.0
+# Of a line of them there are at least so many within so many spacings.
+_ALONG, _FEW = 12.0, 5
+# Within so many spacings a singular point is the one of the round before.
+_SAME = 1.0
+# The error is at least the largest contribution, and random signs of many add up to this part of their root sum
+# square, where nothing better is known.
 _SPREAD = 0.2
 # While the error is larger than this the solution is not resolved, and an estimate of it means little.
 ROUGH = 0.3
 
+Gathered = Callable[[np.ndarray], float]
+
 
 class Marks(NamedTuple):
     """What a round leaves for the next: where (N, D), the spacing, contributions, the rates at which they fall, and
-    whether it is a point that smoothness ends at, all (N,)."""
+    whether it is a point that smoothness ends at, and known to be this one, all (N,)."""
 
     points: np.ndarray
     spacing: np.ndarray
     contribution: np.ndarray
     rate: np.ndarray
     singular: np.ndarray
+    located: np.ndarray
 
 
 def marks(
@@ -45,61 +61,109 @@ def marks(
 ) -> Marks:  # fmt: skip
     """Contributions smoothed, and the rates at which they fall with the spacing.
 
-    power: that of a smooth solution. before: those of the round before, None where it had another order or was
-    not trustworthy; then all fall at the rate ``expected``, that of a smooth solution if None.
+    power: that of a smooth solution. before: those of the round before, None where it was not trustworthy; then all
+    fall at the rate ``expected``, that of a smooth solution if None. Had it another order, contributions of a smooth
+    solution fell by more than the spacing tells, and others by as much.
     """
-    from scipy.spatial import cKDTree
-
     near = cKDTree(points).query(points, k=range(1, min(_WORST, len(points)) + 1))[1]
     largest = contribution[near[:, :_NEAR]].max(axis=1)
     rate = np.full(len(points), power if expected is None else expected)
     if before is not None:
-        old = cKDTree(before.points).query(points)[1]
-        rate = before.rate[old] + power - before.rate.max(initial=power)
+        away, old = cKDTree(before.points).query(points)
         change = np.log(spacing / before.spacing[old])
         with np.errstate(all="ignore"):
             seen = np.log(largest / before.contribution[old]) / change
         known = (np.abs(change) > np.log(_CHANGED)) & np.isfinite(seen)
-        rate = np.where(known, seen, rate)
-        rate = np.median(rate[near[:, :_AROUND]], axis=1)
+        inherited = before.rate[old] + power - before.rate.max(initial=power)
+        rate = np.where(known, seen, inherited)
+        # Around a point that was refined by far nothing is like the point itself.
+        fresh = (change < np.log(_FRESH)) & (away > _BESIDE * spacing)
+        around = np.where(fresh, np.nan, rate)[near[:, :_AROUND]]
+        around[:, 0] = rate
+        rate = np.where(fresh, power, np.nanmedian(around, axis=1))
     worst = (contribution > 0) & (contribution >= contribution[near].max(axis=1)) & (rate < _ROUGH * power)
-    singular = worst.copy()
-    around = near[worst, :_HELD]
-    singular[around[contribution[around] == 0]] = True
-    return Marks(points, spacing, largest, np.clip(rate, _SLOWEST, power), singular)
+    singular, located = _singular(points, spacing, contribution, near, np.flatnonzero(worst), before)
+    return Marks(points, spacing, largest, np.clip(rate, _SLOWEST, power), singular, located)
 
 
-def next_spacing(found: Marks, power: float, error: float, wanted: float, most: float) -> tuple[np.ndarray, float]:
+def _singular(
+    points: np.ndarray, spacing: np.ndarray, contribution: np.ndarray, near: np.ndarray, worst: np.ndarray,
+    before: Marks | None,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Where smoothness ends (N,), and where that was found at the same point once more (N,).
+
+    The worst particles, or in their place those beside without an equation. What else is rough around a point found
+    twice is its fault.
+    """
+    singular, located = np.zeros((2, len(points)), bool)
+    for i in worst:
+        held = near[i, :_HELD][contribution[near[i, :_HELD]] == 0]
+        singular[held if len(held) else i] = True
+    if before is not None and before.singular.any() and singular.any():
+        at = np.flatnonzero(singular)
+        located[at] = cKDTree(before.points[before.singular]).query(points[at])[0] <= _SAME * spacing[at]
+        singular &= located | ~_reached(points, spacing, located, _AFFECTED)
+    return singular, located
+
+
+def _reached(points: np.ndarray, spacing: np.ndarray, some: np.ndarray, reach: float) -> np.ndarray:
+    """The other particles (N,) that are within so many spacings of some of them (N,)."""
+    if not some.any():
+        return np.zeros(len(points), bool)
+    away, near = cKDTree(points[some]).query(points)
+    return ~some & (away < reach * spacing[some][near])
+
+
+def _alone(found: Marks) -> np.ndarray:
+    """The singular points (N,) that are no part of a line of them."""
+    at = np.flatnonzero(found.singular)
+    alone = np.zeros(len(found.points), bool)
+    if len(at):
+        tree = cKDTree(found.points[at])
+        alone[at] = tree.query_ball_point(tree.data, _ALONG * found.spacing[at], return_length=True) < _FEW
+    return alone
+
+
+def next_spacing(
+    found: Marks, power: float, error: float, wanted: float, most: float, gathered: Gathered | None = None
+) -> tuple[np.ndarray, float]:
     """Spacings (N,) at the particles for an error ``wanted`` where it is ``error`` now, and how many that makes.
 
-    most: particles that may be, about; where more were needed, the contributions are equal and larger.
+    most: particles that may be, about; where more were needed, the contributions are equal and larger. gathered: the
+    error that contributions (N,) make together; a guess where None.
     """
     eta = np.maximum(found.contribution, 1e-300)
-    aim = SAFETY * wanted / max(error, 1e-300) * _total(eta.max(), np.sqrt(len(eta)) * np.sqrt(np.mean(eta**2)))
     dim = found.points.shape[1]
-    lowest = np.where(found.singular, SINGULAR, FINER)
+    volume = found.spacing**dim
+    if gathered is None:
+        at_one, now = _SPREAD * np.sqrt(len(eta)), _SPREAD * np.sqrt(np.sum(eta**2))
+    else:
+        at_one, now = gathered(np.ones(len(eta))), gathered(eta)
+    aim = SAFETY * wanted / max(error, 1e-300) * max(float(eta.max()), now)
     rate = np.where(found.singular, found.rate, np.maximum(found.rate, _ROUGH * power))
+    lowest = np.where(found.located, LOCATED, np.where(found.singular, SINGULAR, FINER))
+    alone = found.located | _alone(found)
+    shaded = _reached(found.points, found.spacing, alone, _REACH)
     goal, count = aim, float(len(eta))
     coarser = COARSER if error > ROUGH else GENTLY if error > FAR * wanted else 1.0
     for _ in range(200):
-        factor = np.clip((goal / eta) ** (1.0 / rate), lowest, coarser)
+        highest = np.where(eta < _NOTHING * goal, COARSER, coarser)
+        factor = np.clip((goal / eta) ** (1.0 / rate), lowest, highest)
+        if factor[alone].min(initial=1.0) < FINER:
+            factor = np.where(shaded, np.maximum(factor, 1.0), factor)  # the gradation refines these
         count = float(_children(factor, dim).sum())
+        more = np.sqrt(np.sum(volume * np.minimum(factor, 1.0) ** -dim) / np.sum(volume))
         if count > most:
             goal *= 1.2
-        elif _total(goal, goal * np.sqrt(count)) > 1.05 * aim and count < 0.8 * most:
+        elif goal * max(1.0, at_one * more) > 1.05 * aim and count < 0.8 * most:
             goal *= 0.9
         else:
             break
     return factor * found.spacing, count
 
 
-def _total(largest: float, root: float) -> float:
-    """The error that contributions make, up to a factor: the largest of them, and the root of the sum of squares."""
-    return float(max(largest, _SPREAD * root))
-
-
 def _children(factor: np.ndarray, dim: int) -> np.ndarray:
     """How many particles come of each: as many as fit, or as a point-like refinement needs in its cone."""
-    cone = {1: 2.0 / GROWTH, 2: 45.0, 3: 800.0}[dim]
+    cone = {1: 2.0 / GROWTH, 2: 90.0, 3: 800.0}[dim]
     return np.minimum(factor ** -float(dim), 1.0 + np.where(factor < FINER, FINER**-dim + cone * np.log(FINER / factor),
                                                             np.inf))  # fmt: skip

@@ -22,12 +22,16 @@ Quantity = Callable[[Solution], Any]
 @dataclass(frozen=True)
 class Measured:
     """error: relative, in the measure of the tolerance; infinite where there is none. contribution (N,): of every
-    particle to it, in a scale of their own. scale: the largest |u|. number: of the quantity, if there is one."""
+    particle to it, in a scale of their own. scale: the largest |u|. apart: the distance to the solution of another
+    order, infinite where that is not known to the last. number: of the quantity, if there is one. gathered: the error
+    that contributions (N,) of random signs make, in the scale of theirs; None where that is not known."""
 
     error: float
     contribution: np.ndarray
     scale: float
+    apart: float = np.inf
     number: float | None = None
+    gathered: Callable[[np.ndarray], float] | None = None
 
 
 def measured(sol: Solution, spacing: np.ndarray, order: int, norm: str, quantity: Quantity | None) -> Measured:
@@ -44,25 +48,48 @@ def measured(sol: Solution, spacing: np.ndarray, order: int, norm: str, quantity
         return Measured(np.inf, np.ones(len(values)), scale)
     # A defect of u is one of the equation times spacing^order; with the volume around it counts for all of the domain.
     far = (spacing / spacing.max()) ** min(0, sol.cloud.dim - order) if found.adjoint is not None else 1.0
-    defect = np.asarray(found.error if found.defect is None else found.defect)
-    contribution = far * np.abs(defect).max(axis=1)
-    relative = size(error, values, spacing, norm, sol.cloud.dim)
+    defect = np.abs(np.asarray(found.error if found.defect is None else found.defect))
+    missed = found.missed
+    if missed is not None:
+        defect = np.maximum(defect, np.abs(missed[1]))
+    contribution = far * defect.max(axis=1)
+    of = lambda x: size(np.asarray(x), values, spacing, norm, sol.cloud.dim)  # noqa: E731
+    relative = of(error) if missed is None else max(of(error), of(missed[0]))
     if quantity is None:
-        return Measured(relative, contribution, scale)
+        # A step of Newton's method leads to another order but about.
+        exact = sol.iterations == 1 and sol.defects
+        apart = of(found.towards) if exact else np.inf
+        return Measured(relative, contribution, scale, apart, gathered=_gathering(found, far, defect.shape, norm))
     number, weights = _weights(sol, quantity)
     if weights is None:  # nothing differentiable: the whole solution stands for the number
-        return Measured(relative, contribution, scale, number)
-    away = abs(float(np.sum(weights * error))) / (abs(number) or scale or 1.0)
+        return Measured(relative, contribution, scale, number=number)
+    away = abs(float(np.sum(weights * error)))
+    if missed is not None:
+        away = max(away, abs(float(np.sum(weights * missed[0]))))
     if found.adjoint is not None:
-        contribution = np.abs(found.adjoint(weights) * np.asarray(found.defect)).max(axis=1)
-    return Measured(away, contribution, scale, number)
+        contribution = np.abs(found.adjoint(weights) * defect).max(axis=1)
+    return Measured(away / (abs(number) or scale or 1.0), contribution, scale, number=number)
+
+
+def _gathering(found: Correction, far: Any, shape: tuple[int, ...], norm: str) -> Callable[[np.ndarray], float] | None:
+    """Defects of random signs taken through the inverse: from one place to another they fade, or add up."""
+    through = found.through
+    if through is None or norm != "max":
+        return None
+    signs = np.random.default_rng(0).choice([-1.0, 1.0], shape)
+
+    def gathered(contribution: np.ndarray) -> float:
+        return float(np.abs(through((contribution / far)[:, None] * signs)).max(initial=0.0))
+
+    return gathered
 
 
 def _corrected(sol: Solution) -> Correction:
     """What the estimate knows; of several regions the size of the error alone."""
     if sol.defects:
         return sol.correction()
-    return Correction(np.asarray(sol.error_estimate()).reshape(len(sol.cloud), -1), None, None)
+    error = np.asarray(sol.error_estimate()).reshape(len(sol.cloud), -1)
+    return Correction(error, error, None, None)
 
 
 def size(error: np.ndarray, values: np.ndarray, spacing: np.ndarray, norm: str, dim: int) -> float:

@@ -39,8 +39,9 @@ _EASED = 1.5
 _FULL = 0.8
 # So many solves in a row may fail, each followed by one on a finer cloud.
 _REFUSED = 4
-# A cloud grows at most by this factor, small ones by more; large ones at least by the next.
-_GROWTH, _SMALL, _LEAST, _LARGE = 5.0, {1: 400, 2: 1500, 3: 3000}, 1.5, 5000
+# A cloud grows at most by this factor, small ones by more; large ones at least by the next, where so many attempts make
+# it: around a point that is refined the gradation decides.
+_GROWTH, _SMALL, _LEAST, _LARGE, _PUSHED = 5.0, {1: 400, 2: 1500, 3: 3000}, 1.5, 5000, 3
 # The look at source and coefficients, in parts of the largest |u|; degree of the polynomials it compares with.
 _PART, _DEGREE = 0.05, 4
 # After so many rounds without a smaller error by this factor the search ends.
@@ -200,7 +201,7 @@ class Rounds:
         """Whether the tolerance is reached, all doubts heard."""
         if not found.error <= self.tol:
             return False
-        self._checked(sol, cloud, spacing)
+        self._checked(sol, found, cloud, spacing)
         self.flags = sol.flags
         apart = gaps(sol) if self.quantity is None and self.norm == "max" and sol.defects else None
         self.apart = None
@@ -209,11 +210,14 @@ class Rounds:
         self.reached = self.error <= self.tol and not self.flags and self.apart is None
         return self.reached
 
-    def _checked(self, sol: Solution, cloud: Cloud, spacing: SpacingField) -> None:
-        """The distance to a solve of another order: where it is larger than the estimate, that is the error.
+    def _checked(self, sol: Solution, found: Measured, cloud: Cloud, spacing: SpacingField) -> None:
+        """Where the solution of another order is farther away than the tolerance, that is the error.
 
-        Unless it is the error of the other, which where a solution is barely resolved may be the larger one.
+        Unless it is the error of the other, which where a solution is barely resolved may be the larger one. The
+        estimate of a linear problem has met the other already.
         """
+        if found.apart <= self.tol:
+            return
         try:
             other = self._solve(cloud, sol.order + 2, None if sol.iterations == 1 else np.asarray(sol.u))
         except (ValueError, SolveError) as error:
@@ -227,13 +231,10 @@ class Rounds:
         else:
             number, again = self.number or 0.0, float(np.asarray(self.quantity(other)).sum())
             apart = abs(again - number) / (abs(number) or 1.0)
-        if apart <= self.error:
-            return
-        if apart > self.tol:
+        if apart > max(self.error, self.tol):
             own = measured(other, h, self._operator_order(other), self.norm, self.quantity).error
-            if np.isfinite(own) and own > _OTHERS * apart:
-                return
-        self.error = apart
+            if not (np.isfinite(own) and own > _OTHERS * apart):
+                self.error = apart
 
     def _stalled(self) -> bool:
         errors = [row[2] for row in self.rows]
@@ -247,7 +248,7 @@ class Rounds:
     def _next(self, found: Measured, cloud: Cloud, spacing: SpacingField) -> tuple[SpacingField, Cloud] | None:
         points, h = np.asarray(cloud.points), spacing(np.asarray(cloud.points))
         power = self.solution.order + 1.0 + min(0, cloud.dim - self._operator_order(self.solution))
-        trusted = len(self.rows) > 1 and self.rows[-2][1] == self.rows[-1][1] and np.isfinite(found.error)
+        trusted = len(self.rows) > 1 and np.isfinite(found.error)
         contribution, error = found.contribution, self.error if np.isfinite(self.error) else 1e3
         apart, self.apart = self.apart, None
         here = marks(points, h, contribution, power, self.before if trusted else None)
@@ -257,7 +258,7 @@ class Rounds:
             return None
         most = min(max(_GROWTH * len(cloud), _SMALL[cloud.dim]), self.max_particles)
         wanted = _EASED * self.tol if apart is not None else self.tol if error > self.tol else 0.5 * error
-        made_h, _ = next_spacing(here, power, error, wanted, most)
+        made_h, _ = next_spacing(here, power, error, wanted, most, found.gathered)
         if apart is not None:
             parted = marks(points, h, apart, power, None, _PARTED)
             finer, _ = next_spacing(parted, power, float(apart.max()) / found.scale / _GAP, self.tol, most)
@@ -266,7 +267,7 @@ class Rounds:
         better = self._better(spacing)
         if better is not None:
             field = better.joined(points, made_h)
-        for _ in range(8):
+        for attempt in range(8):
             try:
                 following = self._cloud(field)
             except ValueError as refusal:
@@ -278,7 +279,7 @@ class Rounds:
                 continue
             if len(following) > self.max_particles:
                 field = field.scaled((1.1 * len(following) / self.max_particles) ** (1.0 / cloud.dim))
-            elif apart is None and len(following) < _LEAST * len(cloud) and len(cloud) > _LARGE:
+            elif attempt < _PUSHED and apart is None and len(cloud) > _LARGE and len(following) < _LEAST * len(cloud):
                 field = field.scaled((len(following) / (1.1 * _LEAST * len(cloud))) ** (1.0 / cloud.dim))
             else:
                 break
@@ -286,7 +287,6 @@ class Rounds:
             self._limit("the cloud's maker, which refused finer ones")
             return None
         return field, following
-
 
     def _better(self, spacing: SpacingField) -> SpacingField | None:
         """The spacing of a round before that did better than the last one, over which no other may grow then."""

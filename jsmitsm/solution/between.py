@@ -6,6 +6,7 @@ periodic seam the equation on its other side.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -188,14 +189,49 @@ def _with_source(nums: Numbers, source: np.ndarray) -> Numbers:
     return replace(nums, source=source, held=zero(nums.held), given=zero(nums.given), gamma=zero(nums.gamma))
 
 
+def unseen(disc: Discretization, nums: Numbers, problem: Problem, rows: Any) -> np.ndarray | None:
+    """What the rows miss of the source (N, F), in the scale of u; None where there is no source, or a nonlinear one.
+
+    The rows know a source by its Taylor series at the particles. What differs from them halfway to the neighbours,
+    beside a kink, a jump or a point where it is infinite, is no less real, and rows of all orders miss it alike.
+    """
+    if not disc.linear or disc.traced.source != "variable" or not disc.scheme.sourced or np.shape(nums.source)[-1] < 2:
+        return None
+    points, place = np.asarray(disc.points, float), np.full(len(disc.cloud), -1)
+    place[nums.ids] = np.arange(len(nums.ids))
+    known, missed = np.asarray(nums.source), np.zeros((disc.rec.n_rows, len(nums.ids)))
+    series = [[k for k, (e, _) in enumerate(disc.rec.row_index) if e == f] for f in range(len(disc.rec.orders))]
+    for cls in rows[0]:
+        at = place[cls.ids]
+
+        def left(there: np.ndarray, offset: np.ndarray, at: np.ndarray = at) -> np.ndarray:
+            away = -np.asarray(disc.traced.residuals(there, params=problem.params))
+            for e, some in enumerate(series):
+                powers = [np.prod(offset ** np.array(disc.rec.row_index[k][1]), axis=1) for k in some]
+                away[e] -= np.einsum("kn,kn->n", known[some][:, at], np.stack(powers))
+            return np.where(np.isfinite(away), away, 0.0)  # infinite on the boundary
+
+        missed[np.array(disc.rec.equation_rows)[:, None], at] = _around(disc, cls, points, left)
+    zero = np.zeros_like
+    there = replace(nums, source=missed, held=zero(nums.held), given=zero(nums.given), gamma=zero(nums.gamma))
+    found = np.zeros(disc.held.size)
+    found[~disc.held.reshape(-1)] = np.asarray(right_side(disc, there, *rows))
+    return found.reshape(disc.held.shape)
+
+
 def _mean(disc: Discretization, problem: Problem, cls: Class, points: np.ndarray, fitted: np.ndarray) -> np.ndarray:
     """The mean residual (E, n) around every particle of a class, whose own share of it is zero."""
+    left = lambda at, offset: residual(disc, problem, at, offset, fitted[cls.ids])
+    return _around(disc, cls, points, left)
+
+
+def _around(disc: Discretization, cls: Class, points: np.ndarray, left: Callable[..., Any]) -> np.ndarray:
+    """The mean (E, n) of something that vanishes at the particles of a class and is left(points, offsets) halfway."""
     near = _looked_at(disc, cls)
     total, count = np.zeros((len(disc.rec.orders), len(cls.ids))), np.ones(len(cls.ids))
     for k in range(near.shape[1]):
         there = near[:, k] >= 0
         offset = 0.5 * (points[np.where(there, near[:, k], cls.ids)] - points[cls.ids])
-        found = residual(disc, problem, points[cls.ids] + offset, offset, fitted[cls.ids])
-        total += np.where(there, found, 0.0)
+        total += np.where(there, left(points[cls.ids] + offset, offset), 0.0)
         count += there
     return total / count

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
 from typing import Any
 
 import jax.numpy as jnp
@@ -24,6 +24,7 @@ from jsmitsm.runtime.errors import SolveError
 from jsmitsm.runtime.progress import bar
 from jsmitsm.runtime.tracers import concrete, is_traced
 from jsmitsm.solution.arguments import discretized
+from jsmitsm.solution.between import unseen
 from jsmitsm.solution.fit import Fit
 from jsmitsm.solution.flags import share
 from jsmitsm.solution.run import Run
@@ -47,15 +48,30 @@ class Correction:
     """What an estimate knows besides the size of the error.
 
     error (N, F): the estimated u_exact - u, with its sign.
+    towards (N, F): what leads to the solution of the other order, of which the error may be a part.
     made: the defect (N, F), for ``defect``; None for the methods other than S, which have none.
+    between: for ``missed``, None where there is no source that rows could miss.
     adjoint: of weights (N, F) of the values in a number, those of the defects in it; None where there are no rows.
+    through: of defects (N, F) what they make of u; None where there are no rows.
     units (F,): what the fields are multiplied with to be compared with one another.
     """
 
     error: Any
+    towards: Any
     made: Callable[[], Any] | None
     adjoint: Callable[[np.ndarray], np.ndarray] | None
     units: Any = 1.0
+    through: Callable[[np.ndarray], np.ndarray] | None = None
+    between: Callable[[], Any] | None = None
+
+    @cached_property
+    def missed(self) -> tuple[Any, Any] | None:
+        """What the source makes of u where its Taylor series do not tell it between the particles, and the defect.
+
+        (N, F) each; rows of all orders miss it alike, and so does the distance of their solutions. None where the
+        source is constant, or the equation nonlinear.
+        """
+        return None if self.between is None else self.between()
 
     @cached_property
     def defect(self) -> Any:
@@ -68,8 +84,10 @@ class Correction:
 
 
 @bar("error estimate", parts=(("local fits", 3.0), ("unknowns", 1.0)))
-def correction(fit: Fit, values: Any) -> Correction:
+def correction(fit: Fit, values: Any, made: Run | None = None) -> Correction:
     """The estimated error of the values (N, F), and what it comes from.
+
+    made: the run of the solve, where its numbers and rows are still there.
 
     The defect of the solution in rows of order p + 2, taken through the inverse of their matrix,
 
@@ -95,7 +113,14 @@ def correction(fit: Fit, values: Any) -> Correction:
     trust = _trust(high, *high_rows)
     free = np.flatnonzero(~low.held.reshape(-1))
     run = Run(low, fit.problem, "auto", True, False, "loo")
-    own = cache(lambda: all_rows(low, numbers(low, fit.problem, fit.taylor)))
+
+    @cache
+    def nums() -> Numbers:
+        return numbers(low, fit.problem, fit.taylor) if made is None or made.nums is None else made.nums
+
+    @cache
+    def own() -> tuple[list[Class], list[Row]]:
+        return all_rows(low, nums()) if made is None or made.rows is None else made.rows
 
     def defect() -> Any:
         return _one_scale(_weights(low, *own()), _weights(high, *high_rows), low) * trust * residual
@@ -105,18 +130,25 @@ def correction(fit: Fit, values: Any) -> Correction:
         every: Any = jnp.asarray(zero).at[free].set(x) if is_traced(x) else _put(zero, free, x)
         return every.reshape(low.held.shape)
 
-    def adjoint(weights: np.ndarray) -> np.ndarray:
-        right = np.concatenate([weights.reshape(-1)[free], np.zeros(len(low.floating))])
-        return spread(run.factor_of(*matrix(low, *own())).solve(right, transpose=True)[: len(free)])
+    def through(defects: np.ndarray, transpose: bool = False) -> np.ndarray:
+        right = np.concatenate([defects.reshape(-1)[free], np.zeros(len(low.floating))])
+        return spread(run.factor_of(*matrix(low, *own())).solve(right, transpose=transpose)[: len(free)])
+
+    def between() -> Any:
+        defect = unseen(low, nums(), fit.problem, own())
+        if defect is None:
+            return None
+        return through(defect), defect
 
     try:
         x, _ = above.solved(*entries, residual.reshape(-1)[free], balanced=False)
     except SolveError:
         x, _ = run.solved(*matrix(low, *own()), defect().reshape(-1)[free], balanced=False)
-    error = spread(x)
+    error = towards = spread(x)
     if order > fit.recipe.order >= HIGH and not is_traced(error, trust) and trust.min(initial=1.0) < TRUSTED:
         error = _doubted(fit, low, values, error)
-    return Correction(error, defect, adjoint, comparable(high, high_nums))
+    turned = partial(through, transpose=True)
+    return Correction(error, towards, defect, turned, comparable(high, high_nums), through, between)
 
 
 def _one_scale(mine: Any, theirs: Any, disc: Discretization) -> Any:
@@ -156,7 +188,7 @@ def _against(fit: Fit, low: Discretization, values: Any) -> Correction:
     order = _beside(fit, low)
     if fit.recipe.formulation != "lsq" or is_traced(values, low.cloud.points, fit.problem.params):
         error, units, _ = _towards(fit, low, values, order)
-        return Correction(error, None, None, units)
+        return Correction(error, error, None, None, units)
     nums = numbers(low, fit.problem, fit.taylor)
     own = cache(lambda: np.asarray(misfit(low, nums, values)))
     missed = lambda: _put(np.zeros(low.held.shape), nums.ids, own()[:, None])
@@ -164,7 +196,7 @@ def _against(fit: Fit, low: Discretization, values: Any) -> Correction:
         error, units, _ = _towards(fit, low, values, order)
     else:
         error, units = _by_misfits(fit, low, values, order, own())
-    return Correction(error, missed, None, units)
+    return Correction(error, error, missed, None, units)
 
 
 def _by_misfits(fit: Fit, low: Discretization, values: Any, order: int, own: np.ndarray) -> tuple[Any, Any]:

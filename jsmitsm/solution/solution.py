@@ -18,6 +18,7 @@ from jsmitsm.solution.anywhere import Anywhere
 from jsmitsm.solution.estimate import Correction, correction
 from jsmitsm.solution.fit import Recipe
 from jsmitsm.solution.flags import NOTHING, SQUARED, share
+from jsmitsm.solution.run import Run
 
 # An estimated error above this part of the solution is a flag.
 LARGE = 0.02
@@ -147,7 +148,11 @@ class Solution(Anywhere):
         if self._fit is None:
             raise ValueError("error_estimate: this solution was pickled without its problem; ask before pickling")
         own = getattr(self._fit, "error_estimate", None)  # one of several regions brings its own
-        return self._kept(own(self._values)) if own else self._size(correction(self._fit, self._values))
+        return self._kept(own(self._values)) if own else self._size(self._corrected())
+
+    def _corrected(self) -> Correction:
+        """The estimate, with the rows of the solve where they are still there."""
+        return correction(self._fit, self._values, self._report if isinstance(self._report, Run) else None)
 
     def _size(self, found: Correction) -> Array:
         """The size of an estimated error, kept for the next who asks."""
@@ -200,7 +205,7 @@ class Solution(Anywhere):
         self.refuse_stacked()
         if not self.defects:
             raise ValueError("correction: several regions have an error estimate, but no defects to refine by")
-        found = correction(self._fit, self._values)
+        found = self._corrected()
         self._size(found)
         return found
 

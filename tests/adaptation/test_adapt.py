@@ -9,7 +9,7 @@ import jsmitsm as js
 from jsmitsm.adaptation.data import data_of, unresolved
 from jsmitsm.adaptation.first_cloud import first_cloud
 from jsmitsm.adaptation.layers import layers
-from jsmitsm.adaptation.marking import Marks, next_spacing
+from jsmitsm.adaptation.marking import Marks, marks, next_spacing
 from jsmitsm.adaptation.spacing_field import GROWTH, SpacingField
 
 CORNER = [(0, 0), (1, 0), (1, 1), (-1, 1), (-1, -1), (0, -1)]
@@ -128,6 +128,27 @@ def test_a_peak_between_the_particles_is_seen():
     assert np.linalg.norm(finest - [0.51, 0.117], axis=1).max() < 0.02
 
 
+def test_a_layer_within_a_line_is_told_by_the_drift():
+    """eps u'' + x u' = 0 turns within sqrt(eps) about 0; with the other sign its layers are at the ends."""
+    for sign, finest in ((1.0, 1e-3), (-1.0, 0.1)):
+        problem = js.Problem(lambda u, x: 1e-6 * js.laplacian(u)(x) + sign * x[0] * js.grad(u)(x)[0], ends(-1.0, 1.0))  # noqa: B023
+        points, width = unresolved(data_of(problem, 1, 4), js.interval(-1.0, 1.0, 21), 0.1, 0.05, 1.0, 10_000)
+        assert finest / 2 < width.min(initial=0.1) < 2 * finest
+        assert sign < 0 or abs(points[np.argmin(width), 0]) < 2 * finest
+
+
+def test_a_kink_of_the_source_is_in_the_error():
+    """u'' jumps at 0.3, between particles: rows of two orders miss it by the same, and their distance tells nothing."""
+    bent = lambda x: jnp.sign(x[0] - 0.3) * (x[0] - 0.3) ** 2 / 2
+    source = lambda x: jnp.where(x[0] > 0.3, 1.0, -1.0)
+    problem = js.Problem(lambda u, x: js.laplacian(u)(x) - source(x), ends(-0.045, 0.245))
+    found = js.adapt(problem, line, 1e-3, max_rounds=1)
+    assert found.error < 5 * true_error(found, bent) and true_error(found, bent) < 3 * found.error
+    exact = js.Problem(lambda u, x: js.laplacian(u)(x) - jnp.sin(40.0 * x[0]), ends(0.0, 0.0))
+    smooth = js.solve(exact, js.interval(0.0, 1.0, 15)).correction()  # resolved by what rows know of it
+    assert np.abs(smooth.missed[0]).max() < np.abs(smooth.error).max()
+
+
 def test_a_smooth_source_asks_for_nothing():
     problem = js.Problem(lambda u, x: js.laplacian(u)(x) - jnp.exp(x[0] * x[1]), {"boundary": js.dirichlet(0.0)})
     points, _ = unresolved(data_of(problem, 2, 4), js.from_polygon(SQUARE, 0.1), 0.1, 0.05, 1.0, 100_000)
@@ -162,23 +183,49 @@ def test_a_spacing_field_grows_no_faster_than_it_may():
     assert field(np.array([[9.0, 9.0]])) <= 0.2
 
 
+def marked(points, eta):
+    none = np.zeros(len(points), bool)
+    return Marks(points, np.full(len(points), 0.01), eta, np.full(len(points), 5.0), none, none)
+
+
 def test_contributions_are_made_equal():
     """Of two halves whose contributions differ by 2^5, at a rate of 5 the worse one gets half the spacing."""
     points = np.linspace(0.0, 1.0, 100)[:, None]
     eta = np.where(points[:, 0] < 0.5, 1.0, 2.0**-5)
-    marks = Marks(points, np.full(100, 0.01), eta, np.full(100, 5.0), np.zeros(100, bool))
-    made, count = next_spacing(marks, 5.0, 1e-1, 2e-3, 100_000)
+    found = marked(points, eta)
+    made, count = next_spacing(found, 5.0, 1e-1, 2e-3, 100_000)
     assert made[0] < made[-1]
     assert made[-1] / made[0] == pytest.approx(2.0, rel=1e-6)
-    assert next_spacing(marks, 5.0, 1e-2, 1e-12, 150)[1] <= 150
+    assert next_spacing(found, 5.0, 1e-2, 1e-12, 150)[1] <= 150
 
 
 def test_near_the_tolerance_no_spacing_grows():
-    """What was coarsened there had to be refined again, round after round."""
-    eta = np.where(np.arange(100) < 50, 1.0, 1e-9)
-    marks = Marks(np.linspace(0.0, 1.0, 100)[:, None], np.full(100, 0.01), eta, np.full(100, 5.0), np.zeros(100, bool))
-    assert next_spacing(marks, 5.0, 5e-3, 2e-3, 100_000)[0].max() == pytest.approx(0.01)
-    assert next_spacing(marks, 5.0, 1e-1, 2e-3, 100_000)[0].max() > 0.013
+    """What was coarsened there had to be refined again, round after round; but for what is no matter at all."""
+    points = np.linspace(0.0, 1.0, 100)[:, None]
+    found = marked(points, np.where(np.arange(100) < 50, 1.0, 1e-2))
+    assert next_spacing(found, 5.0, 5e-3, 2e-3, 100_000)[0].max() == pytest.approx(0.01)
+    assert next_spacing(found, 5.0, 1e-1, 2e-2, 100_000)[0].max() > 0.013
+    found = marked(points, np.where(np.arange(100) < 50, 1.0, 1e-9))
+    assert next_spacing(found, 5.0, 5e-3, 2e-3, 100_000)[0].max() > 0.013
+
+
+def test_a_singular_point_found_twice_is_refined_by_far():
+    """Contributions h^(2/3) about 0, on spacings that grow from it; those beside it are left to the gradation."""
+    away = np.cumsum(0.1 * 1.1 ** np.arange(40))
+    points = np.concatenate([-away[::-1], [0.0], away])[:, None] + 1e-3
+
+    def round_of(tip, before):
+        eta = np.where(np.abs(points[:, 0]) < 0.05, tip ** (2 / 3), 1e-9)
+        return marks(points, tip + np.abs(points[:, 0] - 1e-3) / 4, eta, 9.0, before)
+
+    first = round_of(0.1, None)
+    assert not first.singular.any()  # nobody knows a rate yet
+    second = round_of(0.03, first)
+    assert np.flatnonzero(second.singular).tolist() == [40] and not second.located.any()
+    third = round_of(0.0015, second)
+    assert np.flatnonzero(third.located).tolist() == [40]
+    made, _ = next_spacing(third, 9.0, 1e-2, 1e-7, 100_000)
+    assert made[40] < 0.05 * third.spacing[40]
 
 
 def test_rounds_do_not_undo_each_other():

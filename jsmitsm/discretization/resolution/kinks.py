@@ -53,13 +53,11 @@ def _judged(disc: Discretization, cls: Class, equation: int, series: Any, values
     there = values[disc.images.owners(xp.where(valid, near, cls.ids[:, None]))]
     valid = valid & xp.isfinite(there)  # a source may be infinite on the boundary
     there = xp.where(valid, there, 0.0)
-    degrees = np.array([sum(c) for c in multi_indices(dim, degree)])
-    terms = [_monomial(offset, c) * f[:, None] for c, f in zip(multi_indices(dim, degree), series)]
-    last = [t for t, k in zip(terms, degrees) if k > max(degree - 2, 0)]
     count = xp.maximum(xp.sum(valid, axis=1), 1)
     mean = lambda x: xp.sum(xp.where(valid, x, 0.0) ** 2, axis=1) / count
-    misled, promised = mean(sum(terms) - there), mean(sum(last, xp.zeros(valid.shape)))
-    fit, missed = _fitted(offset / length[:, None, None], valid, there, dim, xp)
+    whole, last = _summed(offset, degree, series, xp)
+    misled, promised = mean(whole - there), mean(last)
+    fit, missed = _fitted(offset / length[:, None, None], valid, there, xp)
     size = mean(there)
     astray = (misled > MISLED**2 * promised) | (promised > DIVERGED**2 * size)
     switch = (missed < BETTER**2 * misled) & astray & (misled > FAINT**2 * size)
@@ -69,16 +67,30 @@ def _judged(disc: Discretization, cls: Class, equation: int, series: Any, values
     return xp.where(switch, fitted, series)
 
 
-def _monomial(offset: Any, c: tuple[int, ...]) -> Any:
-    out = 1.0
-    for axis, power in enumerate(c):
-        out = out * offset[..., axis] ** power
-    return out * (offset[..., 0] * 0.0 + 1.0) if not any(c) else out
+def _summed(offset: Any, degree: int, series: Any, xp: Any) -> tuple[Any, Any]:
+    """The series (T, n) at the offsets (n, w, D) and what its last two degrees have of that, (n, w) each."""
+    parts: list[Any] = [0.0] * (degree + 1)
+    for c, power, f in zip(multi_indices(offset.shape[2], degree), _monomials(offset, degree, xp), series):
+        parts[sum(c)] = parts[sum(c)] + power * f[:, None]
+    last = parts[max(degree - 2, 0) + 1 :]
+    return sum(parts), sum(last, xp.zeros(offset.shape[:2]))
 
 
-def _fitted(offset: Any, valid: Any, values: Any, dim: int, xp: Any) -> tuple[Any, Any]:
+def _monomials(offset: Any, degree: int, xp: Any) -> list[Any]:
+    """All monomials (n, w) up to the degree, in their order, each by one product."""
+    made: dict[tuple[int, ...], Any] = {}
+    for c in multi_indices(offset.shape[2], degree):
+        axis = next((k for k, power in enumerate(c) if power), None)
+        if axis is None:
+            made[c] = xp.ones(offset.shape[:2])
+        else:
+            made[c] = made[tuple(power - (k == axis) for k, power in enumerate(c))] * offset[..., axis]
+    return list(made.values())
+
+
+def _fitted(offset: Any, valid: Any, values: Any, xp: Any) -> tuple[Any, Any]:
     """Coefficients (n, M) of quadratic functions fitted to the values (n, w), and their mean square misfit."""
-    p = xp.stack([_monomial(offset, c) for c in multi_indices(dim, DEGREE)], axis=2)
+    p = xp.stack(_monomials(offset, DEGREE, xp), axis=2)
     weight = xp.where(valid, xp.exp(-4.0 * xp.sum(offset**2, axis=2)), 0.0)
     moments = xp.einsum("nwa,nw,nwb->nab", p, weight, p)
     moments = moments + RIDGE * np.eye(moments.shape[1])
