@@ -38,8 +38,9 @@ from jsmitsm.solution.regions.flags import singular, weak_copies
 from jsmitsm.solution.run import Run
 
 # A region takes least squares where convection is so many times diffusion between neighbours, more than where it is
-# alone: what its copies predict is never least squares. Measured in a channel beside a conducting wall, order 4, with
-# and without slip: at 4 and 10 predicted values are 2 to 15 times as accurate, at 20 to 200 up to 100 times less.
+# alone: what its copies predict is never least squares. Measured in a channel beside a conducting wall, order 4: at 4
+# and 10 predicted values are 2 to 15 times as accurate; from 20 to 200 they are 4 to 100 times less accurate, but with
+# slip up to 9 times more.
 CARRIED = 20.0
 
 
