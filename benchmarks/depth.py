@@ -1,9 +1,9 @@
-"""What depth gains and costs: ``python -m benchmarks.depth [waves|named|cost ...]``.
+"""What depth gains and costs: ``python -m benchmarks.depth [waves|named|cost|reach ...]``.
 
 ``waves``: error against particles a wavelength at depth 0, 2 and 4, for waves that the operator makes and for waves
 that the source makes; draws docs/images/depth.png. ``named``: problems of other kinds, at depth 0 and at the default.
-``cost``: seconds of a whole solve with depth over those without, in turn in one process. Writes
-benchmarks/data/depth.json.
+``cost``: seconds of a whole solve with depth over those without, in turn in one process. ``reach``: the least seconds
+to an error, with depth and without. Writes benchmarks/data/depth.json.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ def draw(lines: list[dict[str, Any]]) -> None:
                 run = [v for v in lines if (v["kind"], v["order"], v["depth"]) == (kind, order, depth)]
                 x, y = [v["per wavelength"] for v in run], [v["error"] for v in run]
                 ax.loglog(x, y, style, color=colour, marker=".", ms=4, lw=1.3, label=f"order {order}, depth {depth}")
-        ax.set(title=title, xlabel="particles a wavelength", ylim=(1e-13, 10))
+        ax.set(title=title, xlabel="particles a wavelength", ylim=(1e-11, 10))
         ax.set_xticks([3, 4, 5, 6, 8, 10, 13], ["3", "4", "5", "6", "8", "10", "13"], minor=False)
         ax.set_xticks([], minor=True)
         ax.grid(alpha=0.3)
@@ -209,7 +209,47 @@ def cost() -> dict[str, Any]:
     return {"tables": {"depth-cost": {"columns": columns, "rows": rows, "note": note}}}
 
 
-EXPERIMENTS: dict[str, Callable[[], dict[str, Any]]] = {"waves": waves, "named": named, "cost": cost}
+# Orders, spacings and errors at which the least seconds are looked for.
+REACHED = {
+    "conductor": ((4, 6, 8), (0.16, 0.13, 0.1, 0.08), (1e-6, 1e-8, 1e-10)),
+    "waves": ((6, 8, 10), (0.06, 0.042, 0.028, 0.02), (1e-3, 1e-4, 1e-6)),
+}
+
+
+def reach() -> dict[str, Any]:
+    """The quickest run that reaches an error, of all orders and spacings: with depth and without."""
+    rows, lines = [], []
+    for name, (orders, spacings, errors) in REACHED.items():
+        scene = SCENES[name]
+        for order, spacing in [(order, spacing) for order in orders for spacing in spacings]:
+            cloud = scene.cloud(spacing)
+            for depth in (0, "auto"):
+                took = []
+                for k in range(REPEATS // 2 + 1):
+                    other = moved(cloud, k, scene)
+                    start = time.perf_counter()
+                    sol = js.solve(scene.problem(), other, order=order, depth=depth)
+                    took.append(time.perf_counter() - start)
+                line = {"scene": name, "order": order, "depth": depth, "particles": len(cloud)}
+                lines.append(line | {"error": relative(sol, scene.exact), "seconds": min(took[1:])})
+                print(*lines[-1].values(), flush=True)
+        for error in errors:
+            best = [_quickest(lines, name, depth, error) for depth in (0, "auto")]
+            shown = "{:.3g} ms (order {}, {} particles)"
+            cells = ["-" if b is None else shown.format(1e3 * b["seconds"], b["order"], b["particles"]) for b in best]
+            ratio = "-" if None in best else f"{best[0]['seconds'] / best[1]['seconds']:.1f}"
+            rows.append([scene.about, f"{error:.0e}", *cells, ratio])
+    columns = ["problem", "relative error", "depth 0", "the default", "ratio"]
+    note = f"Milliseconds of a whole solve, the least of {REPEATS // 2} (`python -m benchmarks.depth reach`)."
+    return {"reach": lines, "tables": {"depth-reach": {"columns": columns, "rows": rows, "note": note}}}
+
+
+def _quickest(lines: list[dict[str, Any]], scene: str, depth: Any, error: float) -> dict[str, Any] | None:
+    good = [v for v in lines if (v["scene"], v["depth"]) == (scene, depth) and v["error"] <= error]
+    return min(good, key=lambda v: v["seconds"], default=None)
+
+
+EXPERIMENTS: dict[str, Callable[[], dict[str, Any]]] = {"waves": waves, "named": named, "cost": cost, "reach": reach}
 
 
 def main(names: list[str]) -> None:

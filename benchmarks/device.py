@@ -4,7 +4,8 @@ Each part runs twice, in a process that sees the device and in one that sees the
 microseconds a particle (float64 and float32), beside what the device's memory and arithmetic would allow; the global
 system by multigrid (where pyamg is installed); whole solves, in 2D and 3D, phase by phase; and a value with its
 gradient. Needs no more than the package's own dependencies. Parts that no longer fit into the limit are left out by
-name. Where JAX finds no other device than the CPU the numbers are printed and not kept.
+name. Several devices share the local phase of a solve, the program alone runs on the first. Where JAX finds no other
+device than the CPU the numbers are printed and not kept.
 """
 
 from __future__ import annotations
@@ -199,7 +200,8 @@ def parts(limit: float) -> None:
     import jax
 
     device = jax.devices()[0]
-    print(json.dumps({"device": getattr(device, "device_kind", str(device)), "platform": device.platform}), flush=True)
+    about = {"device": getattr(device, "device_kind", str(device)), "devices": jax.device_count()}
+    print(json.dumps(about | {"platform": device.platform}), flush=True)
     for name, part in PARTS.items():
         if time.perf_counter() - start > limit:
             print(json.dumps({name: "left out: no time"}), flush=True)

@@ -9,9 +9,6 @@ import matplotlib
 from benchmarks.commandline import arguments
 
 EXAMPLES = sorted((Path(__file__).parent.parent / "docs" / "gallery").glob("*.py"))
-# Dear to compile, and numbers like theirs are held elsewhere among the tests, which leave them out: the workflow of the
-# site runs the whole gallery.
-SLOW = {"cavity", "colloid", "composite", "inverse", "island", "kirsch", "kovasznay", "torus"}
 
 
 def run(path):

@@ -18,6 +18,7 @@ import jax; jax.config.update("jax_enable_x64", True)
 import jax.numpy as jnp, numpy as np
 import jsmitsm as js
 from jsmitsm.discretization import sharing
+from jsmitsm.particle import devices
 sharing.PIECE = 32  # in pieces, side by side
 ends = dict.fromkeys(("left", "right", "bottom", "top"), js.dirichlet(0.0))
 cloud = js.rectangle((0, 0), (1, 1), (13, 13), jitter=0.2)
@@ -32,6 +33,17 @@ for device in jax.devices():
         assert value.devices() == {device}, (value.devices(), device)
         results.append([*np.asarray(js.solve(problem(1.0), cloud).u), value, slope])
 assert len(results) == 2 and np.allclose(*results, rtol=1e-11)
+# Both at once, an odd number of rows at that: each makes a part of them.
+devices.WORTH, made, inner = 8, [], devices.side_by_side
+def counted(function, *arguments):
+    made.append((function.__name__, inner(function, *arguments)))
+    return made[-1][1]
+devices.side_by_side = counted
+both = js.solve(problem(1.0), js.rectangle((0, 0), (1, 1), (13, 13), jitter=0.2))
+assert np.allclose(both.u, results[0][:-2], rtol=1e-11)
+assert np.allclose(both.coefficients, js.solve(problem(1.0), cloud).coefficients, rtol=1e-8, atol=1e-8)
+assert {"rows", "coefficients"} <= {name for name, _ in made}
+assert all(len(x.devices()) == 2 for _, some in made for x in jax.tree.leaves(some))
 print("the same on both")
 """
 

@@ -5,7 +5,7 @@ import re
 
 import pytest
 
-from benchmarks.gallery import EXAMPLES, SLOW, run
+from benchmarks.gallery import EXAMPLES, run
 
 PAGE = EXAMPLES[0].parent.parent / "gallery.md"
 
@@ -15,7 +15,7 @@ def code(path):
     return path.read_text().split('"""', 2)[2].strip()
 
 
-@pytest.mark.parametrize("path", [p for p in EXAMPLES if p.stem not in SLOW], ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
 def test_example_runs(path):
     """The assertion inside is the test. All in one module, so that they share compiled programs."""
     pytest.importorskip("matplotlib")

@@ -1,5 +1,6 @@
 """Every notebook runs from its first cell to its last; the numbers are asserted inside of it."""
 
+import re
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -32,3 +33,10 @@ def begun(request):
 @pytest.mark.parametrize("name", sorted(path.name for path in NOTEBOOKS.glob("*.ipynb")))
 def test_notebook_runs(begun, name):
     begun[name].result()
+
+
+@pytest.mark.parametrize("path", sorted(NOTEBOOKS.glob("*.ipynb")), ids=lambda path: path.stem)
+def test_notebook_stands_alone(path):
+    """It runs where nothing but the package is installed."""
+    code = [cell.source for cell in nbformat.read(path, as_version=4).cells if cell.cell_type == "code"]
+    assert not re.search(r"^\s*(from|import) (benchmarks|tests)\b|sys\.path", "\n".join(code), re.M)

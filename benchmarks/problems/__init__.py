@@ -1,4 +1,4 @@
-"""The one table of test problems with known solutions, shared by tests, benchmarks and notebooks.
+"""The one table of test problems with known solutions, shared by tests and benchmarks.
 
 ``CASES`` maps a name to a :class:`Case`: the equation, its domain and particles, the exact solution, and
 the bounds that a solve must keep. ``python -m benchmarks.equations`` measures every case that has

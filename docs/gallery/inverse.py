@@ -31,7 +31,7 @@ def readings(p):
 
 truth, guess = jnp.array([1.5, 0.6, 0.3]), jnp.array([1.0, 0.5, 0.5])
 measured, slopes = readings(truth), jax.jacfwd(readings)
-for _ in range(8):
+for _ in range(6):
     step = jnp.linalg.lstsq(slopes(guess), readings(guess) - measured)[0]
     guess = guess - step
 

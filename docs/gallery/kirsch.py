@@ -26,16 +26,16 @@ def stress(g):
 
 hole = js.sdf.difference(js.sdf.circle((0, 0), 3.0), js.sdf.circle((0, 0), 1.0))
 plate = js.from_sdf(
-    hole, ((-3, -3), (3, 3)), lambda x: 0.16 * np.hypot(*x.T),
+    hole, ((-3, -3), (3, 3)), lambda x: 0.12 * np.hypot(*x.T),
     groups={"hole": lambda x: np.hypot(*x.T) < 2, "far": lambda x: x[:, 0] < 4},
 )
 force = lambda u, x, n: stress(js.grad(u)(x)) @ n
 balance = lambda u, x: js.laplacian(u)(x) + 2 * js.grad(js.divergence(u))(x)
 bcs = {"hole": js.condition(force), "far": js.dirichlet(kirsch)}
-sol = js.solve(js.Problem(balance, bcs, fields=2), plate, order=6)
+sol = js.solve(js.Problem(balance, bcs, fields=2), plate)
 
 beside = stress(sol.grad([[0.0, 1.0]])[0])[0, 0]
-assert abs(beside / 3 - 1) < 1e-2  # spacing a sixth of the radius, order 6
+assert abs(beside / 3 - 1) < 1e-2  # spacing an eighth of the radius
 
 js.plot.principal(sol, stress)
 plt.show()

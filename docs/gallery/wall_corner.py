@@ -23,11 +23,11 @@ problem = js.Problem(
     {"cold": js.dirichlet(0), "warm": js.dirichlet(1), "ends": js.neumann(0)},
 )
 make = lambda spacing: js.from_polygon(corner, spacing, groups=sides)
-found = js.adapt(problem, make, tol=1e-2, start=0.25, progress=False)
+found = js.adapt(problem, make, tol=2e-2, start=0.3, progress=False)
 leak = -float(found.solution.flux("cold"))
 
-# 1 % is what was asked for
-assert abs(leak / (2 * 2 + 1 - 2 * np.log(2) / np.pi) - 1) < 1e-2
+# 2 % is what was asked for
+assert abs(leak / (2 * 2 + 1 - 2 * np.log(2) / np.pi) - 1) < 2e-2
 
 _, (left, right) = plt.subplots(1, 2, figsize=(9, 3.6), layout="constrained")
 js.plot.solution(found.solution, ax=left)

@@ -187,8 +187,8 @@ def adapt(
     >>> import jsmitsm as js
     >>> corner = [(0, 0), (1, 0), (1, 1), (-1, 1), (-1, -1), (0, -1)]
     >>> problem = js.Problem(lambda u, x: js.laplacian(u)(x) + 1.0, {"boundary": js.dirichlet(0.0)})
-    >>> found = js.adapt(problem, lambda spacing: js.from_polygon(corner, spacing), 1e-3)
-    >>> found.reached, found.error < 1e-3
+    >>> found = js.adapt(problem, lambda spacing: js.from_polygon(corner, spacing), 5e-3)
+    >>> found.reached, found.error < 5e-3
     (True, True)
     """
     options = _checked(problem, make, tol, order, start, quantity, norm, max_particles, max_rounds, solve_options)

@@ -9,6 +9,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.discretization.degenerate import Degenerate, settled
 from jsmitsm.discretization.layout import Discretization, crowded
 from jsmitsm.discretization.periodic import with_corners
@@ -77,8 +78,12 @@ def numbers(disc: Discretization, problem: Problem, taylor: Any = None, everywhe
 
 def conditions_of(disc: Discretization, problem: Problem) -> tuple[Any, Any, Any]:
     """The conditions' values (held, given, gamma; see Numbers) of another problem of the same form."""
-    cloud, whole = with_corners(problem, disc.cloud), disc.part is None
-    groups = group_conditions(problem, cloud, disc.rec.order, disc.traced.order, whole)
+    return conditions_at(disc, problem, with_corners(problem, disc.cloud))
+
+
+def conditions_at(disc: Discretization, problem: Problem, cloud: Cloud) -> tuple[Any, Any, Any]:
+    """The same at other points and normals, those of a cloud ``with_corners``."""
+    groups = group_conditions(problem, cloud, disc.rec.order, disc.traced.order, disc.part is None)
     other = replace(disc, groups=groups)
     held = _held_values(other)
     _, _, given = _own_numbers(other, held, None)

@@ -34,18 +34,18 @@ def least_squares(
     def one(cls: Class) -> tuple[Any, Any, Any]:
         block = _class_blocks(disc, nums, cls, shared, there)
         kept = None if parts is None else (cls, block)
-        return _normal_entries(disc, cls, block), _normal_load(disc, nums, cls, block), kept
+        return normal_entries(disc, cls, block), normal_load(disc, nums, cls, block), kept
 
     entries, loads, kept = zip(*on_all_cores("local fits", one, disc, nums, _fitted(disc, nums)))
     if parts is not None:
         parts += kept
-    return *joined(entries), _added_up(*zip(*loads), np.zeros(_unknown_count(disc)))
+    return *joined(entries), added_up(*zip(*loads), np.zeros(_unknown_count(disc)))
 
 
 def least_squares_right_side(disc: Discretization, nums: Numbers, parts: list[tuple[Class, Block]]) -> Any:
     """The right-hand side (n,) alone, for another source and other values in the conditions."""
-    loads = [_normal_load(disc, nums, cls, block) for cls, block in parts]
-    return _added_up(*zip(*loads), np.zeros(_unknown_count(disc)))
+    loads = [normal_load(disc, nums, cls, block) for cls, block in parts]
+    return added_up(*zip(*loads), np.zeros(_unknown_count(disc)))
 
 
 def misfit(disc: Discretization, nums: Numbers, values: Any, parts: list[tuple[Class, Block]] | None = None) -> Any:
@@ -54,13 +54,19 @@ def misfit(disc: Discretization, nums: Numbers, values: Any, parts: list[tuple[C
     A field that counts fewer derivatives than the others has another unit, and is left out. parts: as ``least_squares``
     has filled them, else made again.
     """
-    shared, there = shared_elimination(disc, nums), around(disc, nums)
     own = np.flatnonzero(np.array(disc.rec.weights) == 0)
     if parts is None:
-        parts = [(cls, _class_blocks(disc, nums, cls, shared, there)) for cls in _fitted(disc, nums)]
+        parts = fitted_blocks(disc, nums)
     found = [_missed(disc, nums, cls, block, values)[:, own] for cls, block in parts]
     ids, xp = np.concatenate([cls.ids for cls, _ in parts]), jnp if is_traced(found) else np
     return xp.max(xp.abs(xp.concatenate(found)), axis=1)[np.argsort(ids)]
+
+
+def fitted_blocks(disc: Discretization, nums: Numbers) -> list[tuple[Class, Block]]:
+    """The misfits of all local fits, class by class."""
+    shared, there = shared_elimination(disc, nums), around(disc, nums)
+    one = lambda cls: (cls, _class_blocks(disc, nums, cls, shared, there))  # noqa: E731
+    return on_all_cores("local fits", one, disc, nums, _fitted(disc, nums))
 
 
 def _missed(disc: Discretization, nums: Numbers, cls: Class, block: Block, values: Any) -> Any:
@@ -102,7 +108,7 @@ def _places(disc: Discretization, cls: Class) -> tuple[Any, Any]:
     return near, place.reshape(len(cls.ids), -1)
 
 
-def _normal_entries(disc: Discretization, cls: Class, block: Block) -> tuple[Any, Any, Any]:
+def normal_entries(disc: Discretization, cls: Class, block: Block) -> tuple[Any, Any, Any]:
     """What one class adds to the matrix of the normal equations, as coordinates."""
     near, place = _places(disc, cls)
     host: Any = jnp if is_traced(near) else np
@@ -118,7 +124,7 @@ def _normal_entries(disc: Discretization, cls: Class, block: Block) -> tuple[Any
     return _block_entries(block.matrix, at), r[at], c[at]
 
 
-def _normal_load(disc: Discretization, nums: Numbers, cls: Class, block: Block) -> tuple[Any, Any]:
+def normal_load(disc: Discretization, nums: Numbers, cls: Class, block: Block) -> tuple[Any, Any]:
     """What one class adds to their right-hand side: places and values."""
     near, place = _places(disc, cls)
     return place, _loads_left(block, _right_values(disc, nums, cls), near, place, nums.held, nums.gamma)
@@ -142,7 +148,7 @@ def _block_entries(matrix: Any, at: tuple[np.ndarray, ...]) -> Any:
 
 
 @in_one_program
-def _added_up(places: Sequence[Any], loads: Sequence[Any], start: np.ndarray) -> Any:
+def added_up(places: Sequence[Any], loads: Sequence[Any], start: np.ndarray) -> Any:
     """The right-hand side of the normal equations: the loads of all blocks at their places."""
     if is_traced(places, loads):
         b: Any = jnp.asarray(start)

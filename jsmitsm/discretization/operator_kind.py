@@ -27,9 +27,9 @@ def saddle(rec: Recursion) -> bool:
     return any(rec.weights)
 
 
-def information_travels(disc: Discretization, coefficients: Any) -> bool:
+def information_travels(disc: Discretization, coefficients: Any, most: float = 2.0) -> bool:
     """Whether information travels: operators of first order, hyperbolic and parabolic ones of second,
-    and those whose convection outweighs diffusion between neighbours (cell Peclet number above 2).
+    and those whose convection outweighs diffusion between neighbours (cell Peclet number above ``most``).
 
     There a value predicted by neighbours on all sides is the wrong global form. coefficients: as ``Numbers.jac``.
     """
@@ -46,13 +46,7 @@ def information_travels(disc: Discretization, coefficients: Any) -> bool:
         return True
     if jac is None:
         return False
-    symbol = np.zeros((jac.shape[-1], rec.dim, rec.dim))
-    for s, (_, b) in enumerate(rec.slots):
-        if sum(b) == 2:
-            i, j = [axis for axis in range(rec.dim) for _ in range(b[axis])]
-            symbol[:, i, j] += jac[0, s, 0] / 2
-            symbol[:, j, i] += jac[0, s, 0] / 2
-    values = np.linalg.eigvalsh(symbol)
+    values = _diffusivities(rec, jac)
     diffusion = np.abs(values).max(axis=1)
     if _all_told(disc, (values[:, 0] * values[:, -1] < -1e-10 * diffusion**2).any()).any():
         return True
@@ -62,9 +56,36 @@ def information_travels(disc: Discretization, coefficients: Any) -> bool:
     speed = np.linalg.norm(jac[0, drift, 0], axis=0)
     convective = speed * mean_spacing(disc) / np.where(diffusion > 0, diffusion, np.inf)
     if disc.part is None:
-        return bool(np.median(convective) > 2.0)
-    above, below = _all_told(disc, (convective > 2.0).sum(), (convective <= 2.0).sum())
+        return bool(np.median(convective) > most)
+    above, below = _all_told(disc, (convective > most).sum(), (convective <= most).sum())
     return bool(above > below)
+
+
+def _diffusivities(rec: Recursion, jac: np.ndarray) -> np.ndarray:
+    """The eigenvalues (n, D), ascending, of the second derivatives' coefficients."""
+    symbol = np.zeros((jac.shape[-1], rec.dim, rec.dim))
+    for s, (_, b) in enumerate(rec.slots):
+        if sum(b) == 2:
+            i, j = [axis for axis in range(rec.dim) for _ in range(b[axis])]
+            symbol[:, i, j] += jac[0, s, 0] / 2
+            symbol[:, j, i] += jac[0, s, 0] / 2
+    return np.linalg.eigvalsh(symbol)
+
+
+def turned(disc: Discretization, nums: Numbers) -> np.ndarray:
+    """The particles, the fewer, at which the highest derivatives have the other sign than at the rest.
+
+    In between they have no weight, and what holds of the solution on one side need not on the other.
+    """
+    rec, jac = disc.rec, np.asarray(nums.jac)
+    if rec.fields > 1 or jac.shape[-1] == 1 or rec.dim > 1 and set(rec.orders) != {2}:
+        return np.zeros(0, int)
+    if rec.dim == 1:
+        values = jac[0, [s for s, (_, b) in enumerate(rec.slots) if sum(b) == max(rec.orders)], 0].T
+    else:
+        values = _diffusivities(rec, jac)
+    above, below = nums.ids[(values > 0).all(axis=1)], nums.ids[(values < 0).all(axis=1)]
+    return min(above, below, key=len)
 
 
 def _all_told(disc: Discretization, *counts: Any) -> np.ndarray:
@@ -95,8 +116,9 @@ def cell_peclet(disc: Discretization, nums: Numbers) -> float:
 
 def usual_condition(disc: Discretization) -> float:
     """Of the order of the condition of a regular system: n^(m/D) for an operator of order m, times the contrast of
-    conductivities where there are several regions."""
-    return float(len(disc.cloud) ** (max(disc.rec.orders) / disc.rec.dim)) * getattr(disc, "contrast", 1.0)
+    conductivities where there are several regions; squared where one of these takes the least-squares form."""
+    usual = float(len(disc.cloud) ** (max(disc.rec.orders) / disc.rec.dim)) * getattr(disc, "contrast", 1.0)
+    return usual**2 if getattr(disc, "squared", False) else usual
 
 
 def wave_number(disc: Discretization, nums: Numbers) -> float:

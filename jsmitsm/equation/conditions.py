@@ -91,7 +91,7 @@ def group_conditions(
             raise ValueError(
                 f"bcs[{name!r}]: its particles take the values of their periodic partners; remove its other conditions"
             )
-    if whole and not any(c.kind != "free" for cs in given.values() for c in cs):
+    if whole and highest > 0 and not any(c.kind != "free" for cs in given.values() for c in cs):
         raise ValueError(f"bcs: no condition on any group ({names}), so the solution is not determined; give one")
     groups = []
     counts = {name: 0 for name in names if name not in used and len(cloud.groups[name])}

@@ -9,7 +9,7 @@ import numpy as np
 
 from jsmitsm.evolution.estimate import estimated
 from jsmitsm.evolution.evolution import Evolution, Report
-from jsmitsm.evolution.run import Run, drifted
+from jsmitsm.evolution.run import Run
 from jsmitsm.evolution.steps import dense_output
 from jsmitsm.evolution.steps.control import controlled
 from jsmitsm.evolution.steps.in_time import InTime, looks
@@ -34,20 +34,22 @@ class History:
         self.times: list[float] = []
         self.states: list[np.ndarray] = []
         self.rates: list[np.ndarray] = []
-        self.scale = 0.0
+        self.scale, self.first = 0.0, 0.0
         self.in_time = InTime()
 
     def add(self, t: float, step: Step, number: int | None = None) -> None:
         semi = self.run.semi
         part = step.y[: semi.system.n]
-        self.scale = max(self.scale, float(np.abs(part).max(initial=0.0)))
+        self.scale = max(self.scale, semi.system.largest(part))
         if self.wanted is not None and number is not None and not self.wanted[number]:
             return
         self.times.append(t)
-        self.states.append(semi.placed(part, step.known))
+        self.states.append(semi.kept(part, step.known))
+        if len(self.states) == 1:
+            self.first = max(semi.system.largest(self.states[0]), 1.0)
         if semi.second:
             rates = semi.sample(np.asarray(float(t)))[3]
-            self.rates.append(semi.placed(step.y[semi.system.n :], np.asarray(rates)))
+            self.rates.append(semi.kept(step.y[semi.system.n :], np.asarray(rates)))
 
     def at(self, times: np.ndarray, of: list[np.ndarray]) -> np.ndarray:
         index, weights = dense_output.weights(np.array(self.times), times)
@@ -56,8 +58,16 @@ class History:
 
 def march(run: Run, steps: int | None, tol: float | None, parts: np.ndarray, shown: Any) -> Evolution:
     """All steps, and the Evolution that they make."""
-    t0, t1 = (float(v) for v in run.t)
     began = time.perf_counter()
+    history, fault = marched(run, steps, tol, parts, shown)
+    if fault and run.throw:
+        raise SolveError(f"the run stopped: {fault}; give throw=False for the last good state", [])
+    return _finished(run, parts, history, fault, began)
+
+
+def marched(run: Run, steps: int | None, tol: float | None, parts: np.ndarray, shown: Any) -> tuple[History, str]:
+    """All steps, and what ended them early."""
+    t0, t1 = (float(v) for v in run.t)
     wanted = None
     if steps is not None and 8 * (steps + 1) * len(run.cloud) * run.fields > HISTORY:
         wanted = np.zeros(steps + 1, bool)
@@ -73,39 +83,32 @@ def march(run: Run, steps: int | None, tol: float | None, parts: np.ndarray, sho
             _equal(run, y, np.linspace(t0, t1, steps + 1), history, shown)
     except Stopped as stopped:
         fault = str(stopped)
-    if fault and run.throw:
-        raise SolveError(f"the run stopped: {fault}; give throw=False for the last good state", [])
-    return _finished(run, parts, history, fault, began)
+    return history, fault
 
 
 def started(run: Run, h: float) -> np.ndarray:
     """The state at the start: the impulse of a start that contradicts the conditions, and equations without rates."""
     semi, t0 = run.semi, float(run.t[0])
-    flat = [np.asarray(v).reshape(-1) for v in run.start]
-    y = np.concatenate([v[semi.free] for v in flat])
-    force, held = _now(run, t0, y)
-    asked = semi.masses_held[-1].host @ flat[-1][semi.held]
-    jump = semi.system.force(asked) - held
-    scale = max(float(np.abs(v).max(initial=0.0)) for v in flat)
-    gap = np.abs(flat[0][semi.held] - np.asarray(semi.sample(np.asarray(t0))[0])).max(initial=0.0)
-    still = semi.system.undriven()
+    y, asked, jumps = semi.begun(run.start, t0)
+    force, held = _now(semi, t0, y)
+    jump = asked - held
     small = 1e-7 * h
     if run.algebraic:  # a vanishing step of backward Euler takes the impulse, another settles what holds always
         resolvent, mass = semi.system.resolvent(small), semi.system.mass
         y = resolvent.solve(mass(y) + jump + small * force)
-        force, later = _now(run, t0 + small, y)
+        force, later = _now(semi, t0 + small, y)
         return resolvent.solve(mass(y) + held - later + small * force)
-    if not semi.second and gap > 1e-13 * scale and semi.masses_held[-1].values.size:
-        if still.any():
+    if not semi.second and jumps:
+        if semi.system.largest(semi.system.undriven()):
             return semi.system.resolvent(small).solve(semi.system.mass(y) + jump + small * force)
         return y + semi.system.resolvent(0.0).solve(jump)
     return y
 
 
-def _now(run: Run, t: float, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    samples = run.semi.samples(np.array([t]))
-    force, held = run.semi.forces(*samples)
-    explicit = 0.0 if run.semi.linear else run.semi.explicit(y, t, samples[0][:, 0])
+def _now(semi: Any, t: float, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    samples = semi.samples(np.array([t]))
+    force, held = semi.forces(*samples)
+    explicit = 0.0 if semi.linear else semi.explicit(y, t, samples[0][:, 0])
     return force[0] + explicit, held[0]
 
 
@@ -118,22 +121,17 @@ def _equal(run: Run, y: np.ndarray, times: np.ndarray, history: History, shown: 
     history.add(float(times[0]), step, 0)
     wanted = looks(len(times) - 1)
     for k in range(len(times) - 1):
-        if run.timed.quasilinear and _left(run, step, float(times[k])):
+        if run.timed.quasilinear and run.left(step, float(times[k])):
             run.renew(step.y, float(times[k]))
             stepper = run.stepper(run.semi)
             step = stepper.first(step.y, float(times[k]))
         step = _one(run, stepper, step, float(times[k]), h, k in wanted)
-        _refuse_growth(history, step.y[: run.semi.system.n], float(times[k + 1]))
+        _refuse_growth(history, run.semi.system.largest(step.y[: run.semi.system.n]), float(times[k + 1]))
         history.add(float(times[k + 1]), step, k + 1)
         if k in wanted:
             history.in_time.add(stepper, step, float(times[k + 1]), h, wanted[k])
         run.counts["steps"] += 1
         shown.update()
-
-
-def _left(run: Run, step: Step, t: float) -> bool:
-    """Whether the pencil is to be made anew."""
-    return drifted(run.semi, run.semi.placed(step.y[: run.semi.system.n], step.known), t)
 
 
 def _one(run: Run, stepper: Any, step: Step, t: float, h: float, look: bool) -> Step:
@@ -143,9 +141,8 @@ def _one(run: Run, stepper: Any, step: Step, t: float, h: float, look: bool) -> 
         raise Stopped(f"the stage's system at t = {t:.6g} cannot be solved: {fault}") from fault
 
 
-def _refuse_growth(history: History, values: np.ndarray, t: float) -> None:
-    first, size = max(float(np.abs(history.states[0]).max(initial=0.0)), 1.0), float(np.abs(values).max(initial=0.0))
-    if size > BLOWN * first:
+def _refuse_growth(history: History, size: float, t: float) -> None:
+    if size > BLOWN * history.first:
         raise Stopped(
             f"the solution blew up: it is {size:.1e} at t = {t:.6g}; take more steps, or, where the equation "
             "itself grows so fast, an earlier end"
@@ -153,8 +150,7 @@ def _refuse_growth(history: History, values: np.ndarray, t: float) -> None:
 
 
 def _size(run: Run, error: np.ndarray, scale: float) -> float:
-    part = error[: run.semi.system.n]
-    return float(np.abs(part).max(initial=0.0)) / (scale or 1.0)
+    return run.semi.system.largest(error[: run.semi.system.n]) / (scale or 1.0)
 
 
 def _adaptive(run: Run, y: np.ndarray, t0: float, t1: float, tol: float, history: History, shown: Any) -> None:
@@ -194,7 +190,7 @@ class _Renewing:
 
     def advance(self, last: Step, t: float, h: float, estimate: bool) -> Step:
         run = self.run
-        if run.timed.quasilinear and _left(run, last, t):
+        if run.timed.quasilinear and run.left(last, t):
             run.renew(last.y, t)
             self.inner = run.stepper(run.semi)
             last = self.inner.first(last.y, t)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -19,10 +18,10 @@ from jsmitsm.evolution.space.convection import flag_divergence, flag_open, refus
 from jsmitsm.evolution.space.semidiscrete import Driver, Semidiscrete
 from jsmitsm.evolution.space.timed import Timed
 from jsmitsm.evolution.steps.newton import Newton
-from jsmitsm.evolution.steps.stepping import RadauStepper, Stepper
+from jsmitsm.evolution.steps.stepping import RadauStepper, Step, Stepper
 from jsmitsm.evolution.steps.tableaux import EULER, KENCARP4, RADAU, Additive, Radau
 from jsmitsm.runtime.errors import is_number, some
-from jsmitsm.runtime.tracers import is_traced
+from jsmitsm.runtime.tracers import computed, is_traced
 
 # A quasilinear problem is linearised anew where its coefficients have changed by this part of themselves.
 DRIFT = 0.1
@@ -105,9 +104,14 @@ class Run:
             alpha = float(asked)
         if not alpha or is_traced(self.cloud.points):
             return 0.0
-        points = np.asarray(self.cloud.points)
-        spacing = float((np.prod(np.ptp(points, axis=0)) / len(points)) ** (1.0 / points.shape[1]))
+        spacing = self.spacing
         return alpha / spacing if self.second else alpha / spacing**2
+
+    @property
+    def spacing(self) -> float:
+        """The mean spacing of the whole cloud."""
+        points = np.asarray(self.cloud.points)
+        return float((np.prod(np.ptp(points, axis=0)) / len(points)) ** (1.0 / points.shape[1]))
 
     def pencil(self, t: Any, u: Any) -> Semidiscrete:
         """The semidiscrete equations, linearised at the values u (N, F) where the problem is quasilinear."""
@@ -119,7 +123,7 @@ class Run:
         }  # fmt: skip
         reference = None
         if not timed.quasilinear:
-            with jax.ensure_compile_time_eval():  # under jit, too, what is known is computed
+            with computed():
                 pencil = assemble_pencil(problem, self.cloud, **options)
         else:
             problem.pde = timed.space  # type: ignore[assignment]
@@ -148,7 +152,9 @@ class Run:
         """A flag where particles without conditions have equations that would grow in time."""
         fitness, disc = pencil.layout.fitness, pencil.layout.disc
         wrong = np.zeros(0, int) if fitness is None else fitness.wrong
-        wrong = wrong[disc.n_own[wrong] == 0] if len(wrong) else wrong
+        self._flag_wrong(wrong[disc.n_own[wrong] == 0] if len(wrong) else wrong)
+
+    def _flag_wrong(self, wrong: np.ndarray) -> None:
         if len(wrong):
             flag = (f"The source has the wrong sign in the rows of {len(wrong)} particle(s), first {some(wrong)}: the "
                     "evolution may be unstable.")  # fmt: skip
@@ -172,6 +178,10 @@ class Run:
         t = t if is_traced(t) else np.asarray(float(t))
         self.semi = self.pencil(t, self.semi.lifted(y, t))
 
+    def left(self, step: Step, t: float) -> bool:
+        """Whether the pencil is to be made anew."""
+        return drifted(self.semi, self.semi.placed(step.y[: self.semi.system.n], step.known), t)
+
     @property
     def scheme(self) -> Additive | Radau:
         """The coefficients of its scheme."""
@@ -190,10 +200,13 @@ class Run:
         return Stepper(semi.system, drive, scheme, explicit, None if self.name == "imex" else self.newton)
 
 
-def drifted(semi: Semidiscrete, u: Any, t: float) -> bool:
-    """Whether the coefficients at the values u (N, F) have left those that the pencil was made with."""
-    record, reference = semi.timed.space, semi.reference
-    change = semi.steepness(u, t)
+def drifted(semi: Semidiscrete, u: Any, t: float, some: Any = slice(None)) -> bool:
+    """Whether the coefficients at the values u (N, F) have left those that the pencil was made with.
+
+    some: the particles that are looked at.
+    """
+    record, reference = semi.timed.space, semi.reference[..., some]
+    change = semi.steepness(u, t)[..., some]
     for e, m in enumerate(record.order):
         top = [s for s, (_, b) in enumerate(record.slots) if record.pattern[e, s] and sum(b) == m]
         size = np.sqrt((reference[e, top] ** 2).sum(axis=0))

@@ -5,10 +5,11 @@ Imports show and what stands before it.
 ``import jsmitsm.parallel as jp``; run as ``mpiexec -n 4 python script.py``.
 """
 
-from jsmitsm.parallel.distributed import ParallelCloud, read
+from jsmitsm.parallel.distributed import ParallelCloud
 from jsmitsm.parallel.estimate import error_estimate
 from jsmitsm.parallel.factorization import ParallelFactorization, factorize
-from jsmitsm.parallel.files import save
+from jsmitsm.parallel.files.reading import read
+from jsmitsm.parallel.files.saving import save
 from jsmitsm.parallel.filling import cloud_from
 from jsmitsm.parallel.gradient import value_and_grad
 from jsmitsm.parallel.pencil.evolution import ParallelEvolution, evolve

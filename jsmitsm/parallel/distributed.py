@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from jsmitsm.cloud.cloud import INTERIOR, Cloud
+from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.cloud.regions.region_cloud import RegionCloud
-from jsmitsm.parallel.team import Team, team
-from jsmitsm.runtime.errors import explaining
-from jsmitsm.show.files import from_mesh
+from jsmitsm.parallel.team import Team
 
 # Halvings of an interval until a cut stands between two numbers.
 _HALVINGS = 60
@@ -94,83 +90,12 @@ class ParallelCloud:
         return f"ParallelCloud({len(self.slab)} of {self.slab.count} particles in {self.dim}D here)"
 
 
-@explaining
-def read(
-    points: str | os.PathLike[str], groups: Any = None, normals: Any = None, *, names: Mapping[str, int] | None = None,
-    tags: str | None = None,
-) -> ParallelCloud:  # fmt: skip
-    """A cloud from files, of which every process reads its own slab.
-
-    Parameters
-    ----------
-    points : path
-        ``.npy``: an array (N, D), which is mapped, so that no process reads more than its slab. Any other name: a
-        mesh, as ``js.files.from_mesh`` reads it; every process reads the whole of it, and keeps its slab.
-    groups : path
-        With ``.npy``: an integer array (N,) in another ``.npy``, the group of every particle.
-    normals : path, optional
-        With ``.npy``: an array (N, D) of unit outward normals, NaN in the interior.
-    names : mapping
-        With ``.npy``: the integer that stands for each group, ``"interior"`` among them.
-    tags : str, optional
-        With a mesh: as in ``js.files.from_mesh``.
-
-    Returns
-    -------
-    ParallelCloud
-        The slab of this process.
-
-    Raises
-    ------
-    ValueError
-        For arrays of other shapes, and groups without a name.
-
-    Examples
-    --------
-    ``cloud = jp.read("points.npy", "groups.npy", "normals.npy", names={"interior": 0, "wall": 1})``
-    """
-    us = team()
-    with us.phase():
-        if os.fspath(points).endswith(".npy"):
-            slab = _mapped(us, points, groups, normals, names)
-        else:
-            slab = slab_of(us, from_mesh(os.fspath(points), tags))
-    return ParallelCloud(placed(us, slab))
-
-
-def _mapped(us: Team, points: Any, groups: Any, normals: Any, names: Any) -> Slab:
-    if groups is None or not isinstance(names, Mapping) or INTERIOR not in names:
-        raise ValueError(
-            'groups, names: an .npy of points needs another of integers, one a particle, and names={"interior": 0, ...}'
-        )
-    mapped = np.load(points, mmap_mode="r")
-    if mapped.ndim != 2 or mapped.shape[1] not in (2, 3):
-        raise ValueError(f"points: expected an array (N, 2) or (N, 3), got shape {mapped.shape}")
-    some = _own_slab(us, len(mapped))
-    codes = _part_of(groups, "groups", (len(mapped),), some)
-    known = np.array(list(names.values()))
-    which = np.argmax(codes[:, None] == known, axis=1)
-    stray = np.flatnonzero(known[which] != codes)
-    if len(stray):
-        raise ValueError(f"groups: particle {some.start + stray[0]} has {codes[stray[0]]}, which names does not name")
-    own = np.array(mapped[some], float)
-    given = np.zeros((len(own), 0)) if normals is None else _part_of(normals, "normals", mapped.shape, some)
-    number = np.arange(some.start, some.stop)
-    return Slab(tuple(names), len(mapped), number, own, np.array(given, float), which, np.zeros(len(own), int),
-                normals is not None)  # fmt: skip
-
-
-def _part_of(path: Any, name: str, shape: tuple[int, ...], some: slice) -> np.ndarray:
-    mapped = np.load(path, mmap_mode="r")
-    if mapped.shape != shape:
-        raise ValueError(f"{name}: expected an array {shape}, got shape {mapped.shape}")
-    return np.array(mapped[some])
-
-
-def _own_slab(us: Team, count: int) -> slice:
+def own_slab(us: Team, count: int, rank: int | None = None) -> slice:
+    """The particles of this process, or of another one, before they are dealt anew."""
     if count < us.size:
         raise ValueError(f"cloud: {count} particles for {us.size} processes; start fewer")
-    return slice(us.rank * count // us.size, (us.rank + 1) * count // us.size)
+    rank = us.rank if rank is None else rank
+    return slice(rank * count // us.size, (rank + 1) * count // us.size)
 
 
 def placed(us: Team, slab: Slab) -> Slab:
@@ -185,15 +110,15 @@ def placed(us: Team, slab: Slab) -> Slab:
     return replace(slab, place=place, sizes=sizes)
 
 
-def slab_of(us: Team, cloud: Any) -> Slab:
-    """This process's slab of a cloud that every process has, or of one in slabs."""
+def slab_of(us: Team, cloud: Any, rank: int | None = None) -> Slab:
+    """This process's slab of a cloud that every process has, or of one in slabs; or that of another process."""
     if isinstance(cloud, ParallelCloud):
         return cloud.slab
     if not isinstance(cloud, Cloud):
         raise ValueError(f"cloud: expected a js.Cloud or what jp.read returns, got {type(cloud).__name__}")
     if isinstance(cloud, RegionCloud):
         raise ValueError("cloud: several regions are not made for several processes; use js.solve")
-    some = _own_slab(us, len(cloud))
+    some = own_slab(us, len(cloud), rank)
     group, place = np.zeros(len(cloud), int), np.zeros(len(cloud), int)
     for k, ids in enumerate(cloud.groups.values()):
         group[ids], place[ids] = k, np.arange(len(ids))

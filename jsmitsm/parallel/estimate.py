@@ -7,6 +7,7 @@ import numpy as np
 from jsmitsm.discretization.resolution.digits import room
 from jsmitsm.parallel.assembly import assembled
 from jsmitsm.parallel.local import Local, Settings
+from jsmitsm.parallel.pencil.modes import ParallelModes, errors
 from jsmitsm.parallel.solution import ParallelSolution
 from jsmitsm.runtime.errors import explaining
 from jsmitsm.solution.estimate import compared
@@ -14,20 +15,21 @@ from jsmitsm.taylor.multi_indices import HIGHEST
 
 
 @explaining
-def error_estimate(sol: ParallelSolution) -> np.ndarray:
-    """Estimated error |u - u_exact| at the own particles; see ``js.Solution.error_estimate``.
+def error_estimate(sol: ParallelSolution | ParallelModes) -> np.ndarray:
+    """Estimated error |u - u_exact| at the own particles, or of eigenvalues; see ``js.Solution.error_estimate``.
 
     That towards one other order: no second one is asked.
 
     Parameters
     ----------
-    sol : ParallelSolution
-        Of method S.
+    sol : ParallelSolution or ParallelModes
+        Of method S; or what ``jp.eigen`` found, whose values are found once more by order p + 2.
 
     Returns
     -------
-    array (n,) or (n, F)
-        In units of u, for this process's particles.
+    array (n,) or (n, F), or (k,)
+        In units of u, for this process's particles; of eigenvalues the same on all, for those of a cluster that of the
+        cluster, and infinite where there is no other order.
 
     Raises
     ------
@@ -38,6 +40,8 @@ def error_estimate(sol: ParallelSolution) -> np.ndarray:
     --------
     ``largest = jp.norm(jp.error_estimate(sol))``
     """
+    if isinstance(sol, ParallelModes):
+        return errors(sol)
     us, low = sol._team, sol._local
     order = sol._recipe.order + 2  # the highest that may be asked for
     with us.phase():

@@ -1,4 +1,4 @@
-"""Shapes filled in parts: every process has the particles of its slab, and all together those of one process."""
+"""Shapes filled in parts: every process has the particles of its slab, whatever their number; others dealt out."""
 
 from __future__ import annotations
 
@@ -13,34 +13,36 @@ from jsmitsm.cloud.cloud import INTERIOR
 from jsmitsm.cloud.packing.lattice import lattice_part
 from jsmitsm.cloud.packing.octree import morton
 from jsmitsm.cloud.shapes import checked_bounds, checked_seed, from_sdf, grouped, own_normals
-from jsmitsm.parallel.distributed import ParallelCloud, Slab, placed
+from jsmitsm.parallel.distributed import ParallelCloud, Slab, placed, slab_of
 from jsmitsm.parallel.team import Team, team
-from jsmitsm.runtime.errors import explaining
+from jsmitsm.runtime.errors import explaining, short
 
 
 @explaining
 def cloud_from(make: Callable[..., Any], *arguments: Any, **options: Any) -> ParallelCloud:
-    """A shape filled by all processes, each its own slab of it.
+    """A cloud made by all processes, each its own slab of it; or by the first one, which deals it out.
 
     Parameters
     ----------
-    make : js.from_sdf
-        What fills the shape: ``js.from_sdf``, in 2D or 3D, with one spacing everywhere.
+    make : function
+        ``js.from_sdf``, in 2D or 3D and with one spacing everywhere, is filled in parts. All else that returns a cloud
+        is made whole by the first process: spacings that vary, where particles repel each other everywhere, polygons,
+        lattices.
     *arguments, **options
-        Its own: sdf, bounds, spacing, seed, groups.
+        Its own, as in sdf, bounds, spacing, seed, groups.
 
     Returns
     -------
     ParallelCloud
-        The slab of this process. The boundary is that of ``make``. The interior is the same lattice, with another
-        disorder: one that hangs on the place alone, so that any number of processes fills a shape with the same
-        particles. Every process finds the whole boundary, and no more of the interior than its slab.
+        The slab of this process. Filled in parts the boundary is that of ``make``. The interior is the same lattice,
+        with another disorder: one that hangs on the place alone, so that any number of processes fills a shape with the
+        same particles. Every process finds the whole boundary, and no more of the interior than its slab. What the
+        first process makes is the cloud of ``make``; it alone holds the whole of it, and only until it is dealt out.
 
     Raises
     ------
     ValueError
-        As ``make``, on all processes; and for other makers and spacings that vary, which cannot be made in parts:
-        make such a cloud once, and let every process map it by ``jp.read``.
+        As ``make``, on all processes; and where it makes no cloud, or one in 1D or of several regions.
 
     Examples
     --------
@@ -48,16 +50,29 @@ def cloud_from(make: Callable[..., Any], *arguments: Any, **options: Any) -> Par
     """
     us = team()
     with us.phase():
-        if make is not from_sdf:
-            name = getattr(make, "__name__", repr(make))
-            raise ValueError(
-                f"make: {name} is not made in parts, js.from_sdf is; save its points, groups and normals as .npy, and "
-                "use jp.read"
-            )
-        given = inspect.signature(from_sdf).bind(*arguments, **options)
-        given.apply_defaults()
+        if not callable(make):
+            raise ValueError(f"make: expected a function that returns a cloud, as js.from_sdf, got {short(make)}")
+        given = None
+        if make is from_sdf:
+            given = inspect.signature(from_sdf).bind(*arguments, **options)
+            given.apply_defaults()
+    if given is None or callable(given.arguments["spacing"]):
+        return ParallelCloud(placed(us, _dealt(us, lambda: make(*arguments, **options))))
+    with us.phase():
         slab = _filled(us, **given.arguments)
     return ParallelCloud(_numbered(us, *slab))
+
+
+def _dealt(us: Team, make: Callable[[], Any]) -> Slab:
+    """The own slab of a cloud that the first process makes."""
+    with us.phase():
+        parcels: list[Any] = [None] * us.size
+        if us.rank == 0:
+            cloud = make()
+            parcels = [slab_of(us, cloud, rank) for rank in range(us.size)]
+            if cloud.dim == 1:
+                raise ValueError("cloud: one in 1D has no need of several processes; use js.solve")
+    return us.trade(parcels)[0]
 
 
 def _filled(
@@ -65,11 +80,6 @@ def _filled(
 ) -> tuple[np.ndarray, levelset.Boundary, dict[str, np.ndarray], np.ndarray]:
     """The own interior particles, the whole boundary with its groups, and the slab's ends."""
     lo, hi = checked_bounds(bounds)
-    if callable(spacing):
-        raise ValueError(
-            "spacing: one that varies is not made in parts, since the particles repel each other everywhere; make the "
-            "cloud once by js.from_sdf, save it, and use jp.read"
-        )
     if len(lo) == 1:
         raise ValueError("bounds: a shape in 1D has no need of several processes; use js.from_sdf")
     rule, seed = filling.spacing_function(spacing), checked_seed(seed)

@@ -46,8 +46,9 @@ def newton(us: Team, local: Local, solver: str, u0: Any) -> Found:
             f"u by {found.change:.1e} of its size; start nearer (u0), or use js.solve, which tries more ways"
         )
     with us.phase(local.halo.slab.number):
-        refuse_jumps_at(local.run, *found.at)
-    return Found(*found.at, search.system, search.steps, search.changes, time.perf_counter() - began)
+        refuse_jumps_at(local.run, found.at.values, found.at.taylor)
+    values, taylor, _ = found.at
+    return Found(values, taylor, search.system, search.steps, search.changes, time.perf_counter() - began)
 
 
 class _Free:
@@ -97,7 +98,7 @@ class _Search:
                     raise ValueError(f"u0: shape {np.shape(u0)}, expected a function of x or {shape}")
                 u0 = np.asarray(u0, float).reshape(shape)[slab.number]
             found = Iterate(*map(np.asarray, start(local.disc, local.disc.problem, u0)))
-        return Iterate(*(local.halo.spread(x) for x in found))
+        return Iterate(local.halo.spread(found.values), local.halo.spread(found.taylor))
 
     def _step(self, at: Any) -> Iterate:
         """One full step from the expansions that ``at`` returns."""

@@ -16,7 +16,7 @@ from jsmitsm.parallel.distributed import ParallelCloud, bisected, slab_of
 from jsmitsm.parallel.local import Local, Settings
 from jsmitsm.parallel.newton import newton
 from jsmitsm.parallel.solution import ParallelSolution
-from jsmitsm.parallel.system import SOLVERS
+from jsmitsm.parallel.system import SOLVERS, ways
 from jsmitsm.parallel.team import Team, team
 from jsmitsm.particle.kernels import Kernel
 from jsmitsm.runtime.arrays import ValueOrFunction
@@ -141,5 +141,6 @@ def refuse_others(problem: Any, cloud: Any, method: Any, form: Any, solver: Any)
         if value not in known:
             raise ValueError(f"{name}: {value!r} is none of {', '.join(map(repr, known))}, which are made for several "
                              f"processes{did_you_mean(value, known)}")  # fmt: skip
+    ways(solver, True)
     if getattr(cloud, "dim", 2) == 1:
         raise ValueError("cloud: one in 1D has no need of several processes; use js.solve")

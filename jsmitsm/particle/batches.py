@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jsmitsm.particle import closure, moments
+from jsmitsm.particle import closure, devices, moments
 from jsmitsm.particle.closure import Recovery
 from jsmitsm.particle.elimination import Elimination, Scheme, eliminate
 from jsmitsm.particle.kernels import Kernel
@@ -108,14 +108,16 @@ def effort(size: int, columns: int = 0) -> Any:
     return on_cpu(next(some for most, some in _EFFORT if size + (columns >= _LARGE) <= most))
 
 
-def _by_row(points: Any, kernel: Any, ids: Any, neighbours: Any, given: Operands, each: Any, whole: Any) -> Any:
+def _by_row(
+    points: Any, kernel: Any, ids: Any, neighbours: Any, given: Operands, each: Any, whole: Any
+) -> list[Any]:  # fmt: skip
     """Which of the arguments have a row for each particle of the class; COUNT for the number of these."""
     no, yes = (lambda tree, flag=flag: jax.tree.map(lambda _: flag, tree) for flag in (False, True))
     own = Operands(
         (no if given.jac.shape[0] == 1 else yes)(given.jac), yes(given.own), no(given.data), no(given.shared),
         no(given.lengths), COUNT,
     )  # fmt: skip
-    return no(points), no(kernel), yes(ids), yes(neighbours), own, yes(each), no(whole)
+    return [no(points), no(kernel), yes(ids), yes(neighbours), own, yes(each), no(whole)]
 
 
 def _in_size_classes(function: Any) -> Any:
@@ -135,6 +137,9 @@ def _in_size_classes(function: Any) -> Any:
         form = scheme, big, neighbours.shape[1], jac.shape[1:], one_for_all, operands.shared is None, loose
         known = compiled.setdefault(form, set())
         size = at_hand(known, m, 2 * m, padded_size(m, 4)) if loose else at_hand(known, m, 1.25 * m, padded_size(m))
+        mesh = devices.of_rows(m) if loose else None
+        if mesh is not None:
+            size = -(-size // mesh.size) * mesh.size
         points, kernel, data, whole = in_cloud_size((points, kernel, operands.data, whole), n)
         ids, neighbours, jac, own, each = widened(
             (ids, neighbours, None if one_for_all else jac, operands.own, each), m, size
@@ -144,6 +149,11 @@ def _in_size_classes(function: Any) -> Any:
         arguments = dict(zip(names, (points, kernel, ids, neighbours, given, each, whole)))
         if inside or (kernel is not None and closes_over_traced(kernel.tree_flatten()[1])):
             return cut(inner(scheme, **arguments), m)
+        if mesh is not None:
+            arguments["operands"] = given._replace(count=None)
+            by_row = _by_row(points, kernel, ids, neighbours, given, each, whole)
+            by_row[names.index("operands")] = by_row[names.index("operands")]._replace(count=None)
+            return cut(devices.side_by_side(function, scheme, arguments, dict(zip(names, by_row)), mesh), m)
         options = effort(size, len(fit_and_tail(scheme.rec)[0]))
         most = _SMALL if operands.shared is None else _SMALL_SHARED
         small = scheme.rec.size * scheme.rec.fields <= most and one_kernel.available()

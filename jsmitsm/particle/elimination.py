@@ -6,9 +6,9 @@ those that reach no further than the fit and the deeper ones,
     M_ll u_l = F_l,      M_hl u_l + M_hh u_h = F_h,
 
 the tail u_h follows from u_l. It has more coefficients than equations; of all solutions the one of least Fischer
-norm sum a! u_a^2 is taken, u_h = E (F_h - M_hl u_l) with E = D (M_hh D)^+ and D = diag(1 / sqrt(a!)). That norm does
-not depend on the axes, and it keeps tails small where convection is strong, where degree by degree or axis by axis
-they grow without bound.
+norm sum a! u_a^2 is taken, u_h = E (F_h - M_hl u_l) with E = D (M_hh D)^+ and D = diag(1 / sqrt(a!)), the
+coefficients in units of the farthest neighbour's distance. That norm does not depend on the axes, and it keeps tails
+small where convection is strong, where degree by degree or axis by axis they grow without bound.
 """
 
 from __future__ import annotations
@@ -69,6 +69,11 @@ class Scheme:
         measured best when the fit is drawn to the near ones."""
         return 2.5 if self.rec.depth and self.rec.order >= 3 and not self.uneven else 2.0
 
+    @property
+    def farthest(self) -> float:
+        """The distance of the farthest neighbour in units of the length by which offsets are divided."""
+        return self.decay / 2.0
+
 
 class Elimination(NamedTuple):
     """U = Q F + B c: the local solutions, and the lengths by which the constraints were divided."""
@@ -93,9 +98,9 @@ def _whitening(rec: Recursion) -> np.ndarray:
 
 
 @lru_cache(maxsize=64)
-def _fischer(rec: Recursion) -> np.ndarray:
-    """1 / sqrt(a!) of every coefficient (F K,)."""
-    return np.tile([factorial(a) ** -0.5 for a in multi_indices(rec.dim, rec.reach)], rec.fields)
+def _fischer(rec: Recursion, farthest: float) -> np.ndarray:
+    """1 / sqrt(a!) of every coefficient (F K,) in units of the farthest neighbour's distance, here in scaled ones."""
+    return np.tile([factorial(a) ** -0.5 * farthest ** -sum(a) for a in multi_indices(rec.dim, rec.reach)], rec.fields)
 
 
 def eliminate(scheme: Scheme, jac: Any, length: Any) -> Elimination:
@@ -130,19 +135,20 @@ def eliminate(scheme: Scheme, jac: Any, length: Any) -> Elimination:
 class Deep:
     """The particular solutions (F K, rows) of a recursion deeper than the fit, in parts: most of them are asked for
     their products with a vector or two alone, and a matrix of them all takes as long to make as everything else.
+
+    Whoever asks for a tail has it by the same matrix E: what E itself lacks is then no error of a polynomial that the
+    fit knows, however strong convection is. By factors of it, each product rounded apart, half of the digits are lost.
     """
 
     fitted: Any  # (low columns, low rows): Q of the fit
     across: Any  # (deep rows, low columns): M_hl
-    tail: Any  # (high columns, deep rows): D A^T, A with rows of unit length
-    inverse: Any  # (deep rows, deep rows): (A A^T)^-1 with a ridge
-    unit: Any  # (deep rows,): the lengths of the rows of M_hh D
+    extension: Any  # (high columns, deep rows): E, with a ridge
     place: FitAndTail  # of columns and rows among all
     shape: tuple[int, int]
 
     def extended(self, missing: Any) -> Any:
         """The tail (high columns, m) that follows from what the deep equations miss (deep rows, m)."""
-        return product(self.tail, product(self.inverse, missing / self.unit[:, None]))
+        return product(self.extension, missing)
 
     def __matmul__(self, sides: Any) -> Any:
         """(rows,) or (rows, m) to (F K,) or (F K, m)."""
@@ -154,8 +160,7 @@ class Deep:
 
     def transposed(self, wanted: Any) -> Any:
         """(F K, m) to (rows, m)."""
-        high = product(self.tail.T, _rows_of(wanted, self.place.high))
-        deeper = product(self.inverse, high) / self.unit[:, None]
+        deeper = product(self.extension.T, _rows_of(wanted, self.place.high))
         low = _rows_of(wanted, self.place.low) - product(self.across.T, deeper)
         return _joined(product(self.fitted.T, low), deeper, self.place.first, self.place.deeper, self.shape[1])
 
@@ -175,13 +180,14 @@ def _deepened(scheme: Scheme, matrix: Any, basis: Any, particular: Any) -> tuple
     place = fit_and_tail(scheme.rec)
     rows = _rows_of(matrix, place.deeper)
     across, deep = (_rows_of(rows.T, at).T for at in (place.low, place.high))
-    size = jnp.asarray(_fischer(scheme.rec)[place.high])
+    size = jnp.asarray(_fischer(scheme.rec, scheme.farthest)[place.high])
     deep = deep * size
     unit = _row_lengths(deep, jnp)
     spread = (deep / unit[:, None]).T
     # The ridge bounds the condition of the Gram matrix: its inverse needs no refinement.
     inverse = definite_inverse(gram_matrix(spread) + _ridge(scheme) * np.eye(len(place.deeper)))
-    made = Deep(particular, across, size[:, None] * spread, inverse, unit, place, (matrix.shape[1], matrix.shape[0]))
+    extension = size[:, None] * product(spread, inverse) / unit
+    made = Deep(particular, across, extension, place, (matrix.shape[1], matrix.shape[0]))
     tail = made.extended(-product(across, basis))
     return _joined(basis, tail, place.low, place.high, matrix.shape[1]), made
 
@@ -243,14 +249,12 @@ def unconstrained(scheme: Scheme) -> tuple[Scheme, Elimination]:
 
 def eliminate_on_host(scheme: Scheme, jac: np.ndarray, length: float = 1.0) -> Elimination:
     """``eliminate`` in numpy, where one elimination serves many particles; kept for later."""
-    bare = Scheme(scheme.method, scheme.rec, scheme.free, scheme.dependent, flat=scheme.flat)
+    bare = Scheme(scheme.method, scheme.rec, scheme.free, scheme.dependent, flat=scheme.flat, uneven=scheme.uneven)
     return _eliminated_once(bare, jac.tobytes(), jac.shape, jac.dtype.str, length)
 
 
 @lru_cache(maxsize=256)
-def _eliminated_once(
-    scheme: Scheme, numbers: bytes, shape: tuple[int, ...], dtype: str, length: float
-) -> Elimination:
+def _eliminated_once(scheme: Scheme, numbers: bytes, shape: tuple[int, ...], dtype: str, length: float) -> Elimination:
     made = _eliminated(scheme, np.frombuffer(numbers, dtype).reshape(shape), length)
     for part in made:
         part.setflags(write=False)
@@ -284,7 +288,7 @@ def _deepened_on_host(
 ) -> tuple[np.ndarray, np.ndarray]:
     rec = scheme.rec
     low, high, first, deeper = fit_and_tail(rec)
-    size = _fischer(rec)[high]
+    size = _fischer(rec, scheme.farthest)[high]
     deep = matrix[np.ix_(deeper, high)] * size
     unit = _row_lengths(deep, np)
     spread = np.concatenate([deep / unit[:, None], np.sqrt(_ridge(scheme)) * np.eye(len(deeper))], axis=1)

@@ -30,6 +30,9 @@ SYMPTOMS = {
     "The operator has waves of": "waves",
     "are known to": "rounded",
     "Between the particles the equation is missed": "missed",
+    "Between the particles boundary data": "data",
+    "The equation is not the same": "seam",
+    "changes its sign": "turned",
     "The estimated error is": "estimate",
     "No order reaches the tolerance": "tolerance",
     "The data may not balance": "balance",
@@ -211,7 +214,7 @@ def in_words(error: Exception) -> str:
     """What went wrong in a user's function, with the remedy where the message of Python or JAX has none."""
     text = _without_tracers(str(error))
     if isinstance(error, jax.errors.ConcretizationTypeError | jax.errors.TracerArrayConversionError):
-        return (f"{text.splitlines()[0]} It must be written in jax.numpy: jnp.sin for np.sin or math.sin, "
+        return (f"{text.splitlines()[0].rstrip('.')}. It must be written in jax.numpy: jnp.sin for np.sin or math.sin, "
                 "jnp.where for an if")  # fmt: skip
     if isinstance(error, IndexError):
         return (f"{text}; x is one point of shape (D,), x[0] its first coordinate; u(x) is a number, and a vector (F,) "

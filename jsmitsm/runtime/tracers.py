@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import jax
@@ -26,6 +27,15 @@ def is_traced(*trees: Any) -> bool:
 def recorded() -> bool:
     """Whether every operation is recorded here, one on constants too, as under jit."""
     return isinstance(_probe_p.bind(), jax.core.Tracer)
+
+
+def computed() -> AbstractContextManager[Any]:
+    """Where what is known is computed, under jit too.
+
+    Elsewhere it is nothing: JAX's own context computes the constants of every program that is traced in it, each by a
+    program of its own.
+    """
+    return jax.ensure_compile_time_eval() if recorded() else nullcontext()
 
 
 def closes_over_traced(function: Any, depth: int = 4) -> bool:

@@ -24,16 +24,19 @@ KEPT = 0.5
 # clouds, it is 0.024 to 0.034 times the part of them that does not, at any order.
 EVEN = 1e-4
 # Less than the first changes the solution by less than the discretisation does, and slopes taken at corners leave as
-# much. Between the fields of a system both vary more with the order: less than the second is a doubt, not a refusal.
+# much. Between the fields of a system, and where interfaces curve, both vary more with the order: less than the second
+# is a doubt, not a refusal.
 UNSURE, FALLEN = (1e-5, 1e-3), 0.1
 
 
 def unbalanced(
-    rest: float, imbalance_at: Callable[[int], float], order: int, fields: int, linear: bool, floating: tuple[int, ...]
-) -> tuple[str, bool]:
+    rest: float, imbalance_at: Callable[[int], float], order: int, fields: int, linear: bool,
+    floating: tuple[int, ...], several: bool = False,
+) -> tuple[str, bool]:  # fmt: skip
     """What speaks against data that leave the mean residual ``rest``, and whether that is certain; "" if nothing does.
 
-    imbalance_at: the mean residual of the same problem at another order; floating: the fields that nothing fixes.
+    imbalance_at: the mean residual of the same problem at another order; floating: the fields that nothing fixes;
+    several: regions.
     """
     if rest <= COMPATIBLE:
         return "", False
@@ -53,11 +56,11 @@ def unbalanced(
     )
     names = f"field{'s' * (len(floating) > 1)} {', '.join(map(str, floating))}"
     value = f"the value of {names}, which enters by its derivatives only" if fields > 1 else "the value"
-    small = min(rest, other) < UNSURE[fields > 1]
-    if fields == 1 and small:
+    if fields == 1 and min(rest, other) < UNSURE[0]:
         return "", False
+    small = (fields > 1 or several) and min(rest, other) < UNSURE[1]
     # What the discretisation leaves of a nonlinear system (a pressure at the corners of a lid) cannot be told apart.
-    if fields > 1 and (small or not linear):
+    if small or (fields > 1 and not linear):
         return f"The data may not balance, and nothing fixes {value} {told}.", False
     return f"the conditions are incompatible: nothing fixes {value}, and the data do not balance {told}", True
 

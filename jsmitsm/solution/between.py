@@ -1,4 +1,8 @@
-"""What the local polynomials leave of equation and source between the particles, where nothing made it small."""
+"""What the particles do not see of a problem, and what it would make of the solution.
+
+Between them the residual that the local polynomials leave, where nothing made it small, and boundary data; beyond a
+periodic seam the equation on its other side.
+"""
 
 from __future__ import annotations
 
@@ -8,33 +12,158 @@ from typing import Any
 
 import numpy as np
 
-from jsmitsm.discretization.coefficients import Numbers
+from jsmitsm.cloud.cloud import Cloud
+from jsmitsm.discretization.coefficients import Numbers, conditions_at
 from jsmitsm.discretization.layout import Class, Discretization
+from jsmitsm.discretization.least_squares import least_squares
 from jsmitsm.discretization.leave_one_out import right_side
+from jsmitsm.discretization.periodic import with_corners
+from jsmitsm.discretization.resolution.residuals import residual
 from jsmitsm.discretization.rows import all_coefficients, all_rows
 from jsmitsm.equation.problem import Problem
-from jsmitsm.particle.polynomials import derivative_table
-from jsmitsm.taylor.multi_indices import multi_indices
+
+# A particle of the same group so many times as far as the nearest ones of all, or whose normal has less than this part
+# of the direction, is not beside.
+NEAR, ASIDE = 1.5, 0.5
+# A coefficient or a source halfway is even where it differs from the mean of both ends by less than this part of them,
+# or of so small a part of the largest anywhere: ten particles a wavelength leave 0.05.
+UNEVEN, SMALL = 0.2, 0.01
 
 
-def between(disc: Discretization, nums: Numbers, problem: Problem, values: Any, rows: Any, factor: Any) -> np.ndarray:
-    """What the residual between the particles makes of the solution, (N, F); nothing in the least-squares form.
+def between(run: Any, values: Any) -> np.ndarray:
+    """What the residual between the particles makes of the solution of a run, (N, F)."""
+    disc = run.disc
+    if disc.linear and disc.traced.constant and disc.traced.source != "variable":
+        return np.zeros(disc.held.shape)
+    return _made_of(run, unresolved(disc, run.nums, run.problem, values))
 
-    rows: the classes and their rows, factor: that of the global system. The least-squares form has no rows, and its
-    estimate is another solution, which sees the same.
+
+def even(run: Any) -> bool:
+    """Whether source and coefficients of a linear problem are halfway to the neighbours what they are on both ends.
+
+    A look without polynomials: where it sees nothing, there is no need of theirs.
     """
-    found = np.zeros(disc.held.size)
-    if rows is None or (disc.linear and disc.traced.constant and disc.traced.source != "variable"):
-        return found.reshape(disc.held.shape)
-    missed = unresolved(disc, nums, problem, values)
-    classes, made = rows
-    if not disc.scheme.sourced or disc.scheme.method in ("I", "II"):
-        # Rows of a problem without a source lack its weights; those of I and II hold the neighbours' sources.
-        disc = replace(disc, scheme=replace(disc.scheme, sourced=True))
-        disc.classes = [replace(cls, scheme=replace(cls.scheme, sourced=True)) for cls in classes]
-        classes, made = all_rows(disc, missed)
-    right = np.asarray(right_side(disc, missed, classes, made))
-    solved = factor.solve(np.concatenate([right, np.zeros(factor.n - len(right))]))
+    disc, points = run.disc, np.asarray(run.disc.points, float)
+    if not disc.linear or disc.traced.constant and disc.traced.source != "variable":
+        return disc.linear
+
+    def at(x: np.ndarray) -> np.ndarray:
+        jac, source = disc.traced.coefficients(x, 0, params=run.problem.params)
+        parts = [np.asarray(jac)[:, :, 0]] + ([] if source is None else [np.asarray(source)[:, None, 0]])
+        return np.concatenate([np.broadcast_to(p, (*p.shape[:2], len(x))) for p in parts], axis=1)
+
+    known = at(points)
+    largest = np.abs(known).max(axis=2, keepdims=True)
+    for cls in disc.classes:
+        near = _looked_at(disc, cls)
+        for other in near.T:
+            ids, to = cls.ids[other >= 0], other[other >= 0]
+            there, ends = at(0.5 * (points[ids] + points[to])), (known[:, :, ids], known[:, :, to])
+            size = np.maximum(np.maximum(*map(np.abs, ends)), SMALL * largest)
+            if (np.abs(there - 0.5 * (ends[0] + ends[1])) > UNEVEN * size).any():
+                return False
+    return True
+
+
+def _looked_at(disc: Discretization, cls: Class) -> np.ndarray:
+    """The neighbours (n, k) halfway to which one looks: on a lattice those along its axes and across its cells."""
+    dim = disc.rec.dim
+    return np.asarray(cls.neighbours)[:, 1 : 1 + 2 * dim + (2**dim if dim > 1 else 0)]
+
+
+def unseen_data(run: Any) -> np.ndarray:
+    """What boundary data do between the particles, unseen by them, makes of the solution of a run, (N, F).
+
+    Data given by functions are looked at halfway to the nearest particles of the same group, and compared with the
+    mean of both. A function that says there what it says at the particle has nothing to tell, nor has an array.
+    """
+    disc, zero = run.disc, np.zeros_like
+    ways = 2 * (disc.rec.dim - 1)
+    if not ways or not all(group.linear for group in disc.groups):
+        return np.zeros(disc.held.shape)
+    cloud = with_corners(run.problem, disc.cloud)
+    here = [np.asarray(x, float) for x in conditions_at(disc, run.problem, cloud)]
+    found = [zero(x) for x in here]
+    own = np.flatnonzero(disc.n_own)
+    for k in range(ways):
+        moved, near = _halfway(disc, cloud, k)
+        there = conditions_at(disc, run.problem, moved)
+        for total, a, b, other in zip(found, here, there, (near, np.searchsorted(own, near[own]), near)):
+            total += np.where(a == b, 0.0, b - 0.5 * (a + a[other])) / ways
+    if not any(x.any() for x in found):
+        return np.zeros(disc.held.shape)
+    held, given, gamma = found
+    made = _made_of(run, replace(run.nums, source=zero(run.nums.source), held=held, given=given, gamma=gamma))
+    # A velocity that is zero has no scale to measure what the other's data make of it with.
+    given_in = held.any(axis=0)
+    return np.where(given_in if given_in.any() else True, made, 0.0)
+
+
+def _halfway(disc: Discretization, cloud: Cloud, k: int) -> tuple[Cloud, np.ndarray]:
+    """The cloud with its boundary particles halfway to their k-th nearest of the same group, and who these are.
+
+    One without such a neighbour, or on another side than this, stays.
+    """
+    from scipy.spatial import cKDTree
+
+    points = np.asarray(cloud.points, float)
+    normals = None if cloud.normals is None else np.asarray(cloud.normals, float)
+    near = np.arange(len(points))
+    reach = NEAR * cKDTree(points).query(points, k=min(2 * disc.rec.dim + 1, len(points)))[0][:, -1]
+    for group in disc.groups:
+        if len(group.ids) < k + 2:
+            continue
+        away, at = (x[:, k + 1] for x in cKDTree(points[group.ids]).query(points[group.ids], k=k + 2))
+        beside = away <= reach[group.ids]
+        if normals is not None:
+            beside &= ~(np.einsum("nd,nd->n", normals[group.ids], normals[group.ids[at]]) < ASIDE)
+        near[group.ids] = np.where(beside, group.ids[at], group.ids)
+    if normals is not None:
+        normals = normals + normals[near]
+        normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+    # Two particles meet halfway between them, which no cloud may have.
+    _, static = cloud.tree_flatten()
+    return Cloud.tree_unflatten(static, (0.5 * (points + points[near]), normals)), near
+
+
+def seam(run: Any, values: Any) -> np.ndarray:
+    """What an equation that does not repeat itself on both sides of a periodic pair makes of the solution, (N, F).
+
+    The particles of second groups carry no equation: theirs is asked of the polynomials of their partners.
+    """
+    disc, nums = run.disc, run.nums
+    aside = np.flatnonzero(disc.partner != np.arange(len(disc.cloud)))
+    if not len(aside) or disc.linear and disc.traced.constant and disc.traced.source != "variable":
+        return np.zeros(disc.held.shape)
+    owner, points = disc.partner[aside], np.asarray(disc.cloud.points, float)
+    fitted = np.asarray(all_coefficients(disc, nums, values), float)[owner]
+    nowhere = np.zeros((len(aside), disc.rec.dim))
+    missed = [residual(disc, run.problem, points[at], nowhere, fitted) for at in (aside, owner)]
+    place = np.full(len(disc.cloud), -1)
+    place[nums.ids] = np.arange(len(nums.ids))
+    source = np.zeros((disc.rec.n_rows, len(nums.ids)))
+    known = place[owner] >= 0
+    rows, at = np.array(disc.rec.equation_rows)[:, None], place[owner[known]]
+    sides = 1 + np.bincount(at, minlength=len(nums.ids))[at]
+    np.add.at(source, (rows, at), (missed[0] - missed[1])[:, known] / sides)
+    return _made_of(run, _with_source(nums, source))
+
+
+def _made_of(run: Any, nums: Numbers) -> np.ndarray:
+    """The solution (N, F) of a run's system with the source and data of ``nums`` alone, its size."""
+    disc = run.disc
+    if run.formulation == "lsq":
+        right = least_squares(disc, nums)[3]
+    else:
+        classes, rows = run.rows
+        if not disc.scheme.sourced or disc.scheme.method in ("I", "II"):
+            # Rows of a problem without a source lack its weights; those of I and II hold the neighbours' sources.
+            disc = replace(disc, scheme=replace(disc.scheme, sourced=True))
+            disc.classes = [replace(cls, scheme=replace(cls.scheme, sourced=True)) for cls in classes]
+            classes, rows = all_rows(disc, nums)
+        right = right_side(disc, nums, classes, rows)
+    right, found = np.asarray(right), np.zeros(disc.held.size)
+    solved = run.factor.solve(np.concatenate([right, np.zeros(run.factor.n - len(right))]))
     found[~disc.held.reshape(-1)] = np.abs(solved[: len(right)])
     return found.reshape(disc.held.shape)
 
@@ -42,7 +171,7 @@ def between(disc: Discretization, nums: Numbers, problem: Problem, values: Any, 
 def unresolved(disc: Discretization, nums: Numbers, problem: Problem, values: Any) -> Numbers:
     """The numbers of the same operator with, for its source, what the polynomials leave of the residual.
 
-    The residual is looked at halfway to the nearest 2 D neighbours, and averaged: a source or a coefficient that the
+    The residual is looked at halfway to the nearest neighbours, and averaged: a source or a coefficient that the
     particles do not see, or whose Taylor series ends before it reaches the neighbours, shows there.
     """
     fitted = np.asarray(all_coefficients(disc, nums, values), float)
@@ -51,6 +180,11 @@ def unresolved(disc: Discretization, nums: Numbers, problem: Problem, values: An
     source = np.zeros((disc.rec.n_rows, len(nums.ids)))
     for cls in disc.classes:
         source[np.array(disc.rec.equation_rows)[:, None], place[cls.ids]] = _mean(disc, problem, cls, points, fitted)
+    return _with_source(nums, source)
+
+
+def _with_source(nums: Numbers, source: np.ndarray) -> Numbers:
+    """The numbers of the same operator with this source and no data."""
     zero = np.zeros_like
     return replace(nums, source=source, held=zero(nums.held), given=zero(nums.given), gamma=zero(nums.gamma))
 
@@ -87,13 +221,13 @@ def unseen(disc: Discretization, nums: Numbers, problem: Problem, rows: Any) -> 
 
 def _mean(disc: Discretization, problem: Problem, cls: Class, points: np.ndarray, fitted: np.ndarray) -> np.ndarray:
     """The mean residual (E, n) around every particle of a class, whose own share of it is zero."""
-    left = lambda at, offset: _residual(disc, problem, at, offset, fitted[cls.ids])
+    left = lambda at, offset: residual(disc, problem, at, offset, fitted[cls.ids])
     return _around(disc, cls, points, left)
 
 
 def _around(disc: Discretization, cls: Class, points: np.ndarray, left: Callable[..., Any]) -> np.ndarray:
     """The mean (E, n) of something that vanishes at the particles of a class and is left(points, offsets) halfway."""
-    near = np.asarray(cls.neighbours)[:, 1 : 1 + 2 * disc.rec.dim]
+    near = _looked_at(disc, cls)
     total, count = np.zeros((len(disc.rec.orders), len(cls.ids))), np.ones(len(cls.ids))
     for k in range(near.shape[1]):
         there = near[:, k] >= 0
@@ -101,19 +235,3 @@ def _around(disc: Discretization, cls: Class, points: np.ndarray, left: Callable
         total += np.where(there, left(points[cls.ids] + offset, offset), 0.0)
         count += there
     return total / count
-
-
-def _residual(disc: Discretization, problem: Problem, at: np.ndarray, offset: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """The residual (E, n) of polynomials u (n, F, K) at their centres plus ``offset``."""
-    rec, traced = disc.rec, disc.traced
-    powers = np.stack([np.prod(offset ** np.array(a), axis=1) for a in multi_indices(rec.dim, rec.reach)], axis=1)
-    slots = []
-    for f, b in traced.slots:
-        lower, factor = derivative_table(rec.dim, rec.reach, b)
-        slots.append(np.einsum("nk,nk->n", u[:, f], powers[:, lower] * factor))
-    value = np.stack(slots)[:, None]
-    if not traced.linear:
-        return np.asarray(traced.coefficients(at, 0, params=problem.params, slots=value)[1])[:, 0]
-    jac, source = traced.coefficients(at, 0, params=problem.params)
-    found = np.einsum("esn,sn->en", np.broadcast_to(np.asarray(jac)[:, :, 0], (*jac.shape[:2], len(at))), value[:, 0])
-    return found if source is None else found + np.asarray(source)[:, 0]

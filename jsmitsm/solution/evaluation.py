@@ -64,7 +64,7 @@ def checked_points(points: Any, dim: int) -> Any:
         if points.ndim == 2 and not np.isfinite(points).all():
             raise ValueError("points: NaN or infinite coordinates; evaluate at finite points")
     if points.ndim != 2 or points.shape[1] != dim:
-        raise ValueError(f"points: expected shape (M, {dim}), got {points.shape}; one point is points[None, :]")
+        raise ValueError(f"points: expected shape (M, {dim}), got {points.shape}; one point is [point]")
     return points
 
 

@@ -321,7 +321,7 @@ class Run:
         self.messages.append("The conditions fix the solution only up to a constant; its mean over the particles is 0.")
         told, certain = unbalanced(
             self._rest(), partial(self._imbalance_at, taylor), self.disc.rec.order, self.disc.rec.fields,
-            self.disc.linear, self.disc.floating,
+            self.disc.linear, self.disc.floating, len(self.operators()) > 1,
         )  # fmt: skip
         if certain:
             self.fail(told)

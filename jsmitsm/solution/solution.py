@@ -225,7 +225,8 @@ class Solution(Anywhere):
         Tested when first asked for: roughness between neighbours, near singularity, an unresolved
         source or coefficient, hopeless stencils, misfits of the equation. Linear problems of one field that pass
         by far are cleared. For all others, of up to 200,000 particles, the error is estimated: below 2 % clears what
-        is only suspected, above is a flag. No flag is no proof.
+        is only suspected, above is a flag. Between the particles, and beyond periodic pairs, equation and data are
+        looked at too. No flag is no proof.
         """
         self.refuse_stacked()
         if self._found is None and self._report is not None:

@@ -12,7 +12,7 @@ from jsmitsm.discretization.coefficients import numbers
 from jsmitsm.discretization.layout import discretize, table
 from jsmitsm.equation.problem import Problem
 from jsmitsm.equation.unknowns.regular import regular_in_regions, regular_problem
-from jsmitsm.equation.unknowns.stated import stated
+from jsmitsm.equation.unknowns.stated import begun, stated
 from jsmitsm.equation.unknowns.two_fields import two_fields, two_parts
 from jsmitsm.linear.linsolve import Solver
 from jsmitsm.particle.kernels import Kernel
@@ -86,7 +86,7 @@ def solve(
         Keep only the first so many free coefficients (I, II, III).
     formulation : {"auto", "loo", "lsq"}
         "loo" (each value is predicted by its neighbours), "lsq" (least squares over all local fits) or "auto": "lsq"
-        where information travels, and in systems with a pressure; else "loo".
+        where information travels, and in systems with a pressure; else "loo". With several regions, region by region.
     solver : {"auto", "dense", "sparse", "mixed", "iterative"}
         "auto", "dense" (pure JAX), "sparse" (direct), "mixed" (direct, its factors in float32 and the rest in
         float64: two thirds of the time and memory) or "iterative".
@@ -208,8 +208,10 @@ def with_extras(problem: Problem, cloud: Cloud, *, order: Any, **options: Any) -
     if term is not None:
         run.term, run.whole = term, stated(problem, problem.extras.unknowns, term.points)
 
-    def again(order: int) -> Any:
-        other = {"method": "S", "depth": run.disc.rec.depth, "solver": options["solver"]}
-        return solve(problem, cloud, order=order, **other)._values
+    def again(order: int, unknowns: Any, u0: Any) -> Any:
+        other = {"method": "S", "depth": run.disc.rec.depth, "solver": options["solver"], "u0": u0}
+        near = problem if u0 is None else problem.replace(unknowns=unknowns)
+        return solve(near, cloud, order=order, **other)._values
 
-    return solve_constrained(problem, run, regions_recipe(run) if several else recipe_of(run), again)
+    recipe = regions_recipe(run) if several else recipe_of(run)
+    return solve_constrained(problem, run, recipe, again, begun(problem, options["u0"]))

@@ -105,11 +105,81 @@ def test_a_constraint_that_is_not_linear_is_met_by_newton_steps():
     assert sol.converged and 2 < sol.iterations < 12 and abs(jnp.mean(sol.u**2) - 1.0) < 1e-8
 
 
+BOTH = {side: js.dirichlet(0.0) for side in ("left", "right")}
+
+
+@pytest.mark.parametrize("middle", [0.5, 2.0])
+def test_a_nonlinear_problem_on_both_sides_of_its_fold(middle):
+    """u'' + c exp(u) = 0: u = 2 log(cosh(a) / cosh(a (1 - 2 x))), c = 8 a^2 / cosh(a)^2, by its value in the middle."""
+    pde = lambda u, x, g: js.laplacian(u)(x) + g["c"] * jnp.exp(u(x))
+    given = [js.constraint(lambda s: s([[0.5]])[0], middle)]
+    sol = js.solve(js.Problem(pde, BOTH, unknowns={"c": 1.0}, constraints=given), js.interval(0.0, 1.0, 17), order=6)
+    a = np.arccosh(np.exp(middle / 2))
+    assert abs(sol.unknowns["c"] - 8 * a**2 / np.cosh(a) ** 2) < 1e-7
+    exact = 2 * np.log(np.cosh(a) / np.cosh(a * (1 - 2 * np.asarray(sol.cloud.points[:, 0]))))
+    assert abs(sol.u - exact).max() < 1e-7 and sol.converged and not sol.flags
+    assert abs(sol.u - exact).max() < 10 * sol.error_estimate().max() + 1e-12
+
+
+def test_an_eigenvalue_is_an_unknown():
+    """u'' + c u = 0 with the mean square of one half: c = pi^2; from u = 0 no step is determined."""
+    pde = lambda u, x, p, g: js.laplacian(u)(x) + p * g["c"] * u(x)
+    given = [js.constraint(lambda s: jnp.mean(s.u**2), 0.5)]
+    problem = js.Problem(pde, BOTH, params=2.0, unknowns={"c": 4.0}, constraints=given)
+    sol = js.solve(problem, ROD, order=8, u0=lambda x, p: x[0] * (1 - x[0]))
+    assert abs(sol.unknowns["c"] - np.pi**2 / 2) < 1e-8
+    with pytest.raises(js.SolveError, match="determine no step"):
+        js.solve(problem, ROD, order=8)
+
+
+def test_an_unknown_that_enters_nonlinearly_and_derivatives():
+    """k u'' = exp(q) with the mean -p: q = log(12 k p)."""
+
+    def q(k, mean):
+        given = [js.constraint(lambda s: s.integral(), -mean)]
+        pde = lambda u, x, k, g: k * js.laplacian(u)(x) - jnp.exp(g["q"])
+        return js.solve(js.Problem(pde, BOTH, params=k, unknowns={"q": 0.0}, constraints=given), ROD).unknowns["q"]
+
+    assert abs(q(2.0, 0.25) - np.log(6.0)) < 1e-10
+    found = jax.grad(q, (0, 1))(2.0, 0.25)
+    assert np.allclose(found, (0.5, 4.0), rtol=1e-7)
+    ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(lambda x, g: jnp.exp(g["q"]))}
+    mean = js.constraint(lambda s: s.integral(), 1.0)
+    ask = js.Problem(lambda u, x, g: js.laplacian(u)(x), ends, unknowns={"q": 0.0}, constraints=[mean])
+    assert not bool(jax.jit(lambda: js.solve(ask, ROD).converged)())
+
+
+def test_a_free_constant_of_a_nonlinear_problem():
+    """u'' + u'^2 = 1 + x^2 with the slopes 0 and 1: u = x^2 / 2 + 2 - 1 / 6, whose mean is 2."""
+    ends = {"left": js.neumann(0.0), "right": js.neumann(1.0)}
+    pde = lambda u, x: js.laplacian(u)(x) + js.grad(u)(x)[0] ** 2 - 1 - x[0] ** 2
+    sol = js.solve(js.Problem(pde, ends, constraints=[js.constraint(lambda s: s.integral(), 2.0)]), ROD)
+    assert abs(sol.u - (ROD.points[:, 0] ** 2 / 2 + 2 - 1 / 6)).max() < 1e-10 and not sol.flags
+
+
+def test_a_nonlinear_conductivity_beside_another_material():
+    """((1 + u) u')' = -q in a, u'' = 0 in b, with the value 0.3 in the middle of a: U + U^2 / 2 is a parabola in a."""
+    cloud = js.regions({"a": (0.0, 0.5), "b": (0.5, 1.0)}, spacing=0.05)
+    flux = {"a": lambda u, x, n, g: (1 + u(x)) * n @ js.grad(u)(x), "b": lambda u, x, n, g: 2 * n @ js.grad(u)(x)}
+    pde = {
+        "a": lambda u, x, g: js.divergence(lambda y: (1 + u(y)) * js.grad(u)(y))(x) + g["q"],
+        "b": lambda u, x, g: 2 * js.laplacian(u)(x),
+    }
+    bcs = {"boundary": js.dirichlet(0.0), "a|b": js.interface(flux=flux)}
+    given = [js.constraint(lambda s: s([[0.25]])[0], 0.3)]
+    sol = js.solve(js.Problem(pde, bcs, unknowns={"q": 1.0}, constraints=given), cloud, order=6)
+    # W = u + u^2 / 2 = c x - q x^2 / 2; at 1/2: u = v, and the flux c - q / 2 = -4 v goes on.
+    w, half = 0.3 + 0.3**2 / 2, lambda q: 4 * (0.345 + q / 32) / 2 - q / 8
+    v = lambda q: np.sqrt(1 + 2 * half(q)) - 1
+    q = float(sol.unknowns["q"])
+    assert abs(w - 0.345) < 1e-12 and abs(4 * (0.345 + q / 32) - q / 2 + 4 * v(q)) < 1e-5
+    assert sol.converged and not sol.flags and abs(float(sol([[0.25]])[0]) - 0.3) < 1e-8
+
+
 def test_what_is_refused():
     ends = {side: js.dirichlet(0.0) for side in ("left", "right")}
     mean = js.constraint(lambda s: s.integral(), 1.0)
     pde = lambda u, x, g: js.laplacian(u)(x) - g["q"]
-    one = dict(unknowns={"q": 0.0}, constraints=[mean])
     refused = [
         (dict(pde=pde, unknowns={"q": 0.0}), "1 unknown.*no constraint"),
         (dict(pde=pde, unknowns={"q": 0.0}, constraints=[mean, mean]), "got 2 for 1 unknown"),
@@ -117,9 +187,6 @@ def test_what_is_refused():
         (dict(pde=pde, unknowns={"q": 0.0}, constraints=[lambda s: 0.0]), r"constraints\[0\]: expected js.constraint"),
         (dict(pde=pde, unknowns={"q": "a"}, constraints=[mean]), r"unknowns\['q'\]: expected a number"),
         (dict(pde=pde, unknowns=["q"], constraints=[mean]), "unknowns: expected a dict"),
-        (dict(pde=lambda u, x, g: js.laplacian(u)(x) - jnp.exp(g["q"]), **one), "nonlinearly"),
-        (dict(pde=lambda u, x, g: js.laplacian(u)(x) + g["q"] * u(x) - 1.0, **one), "multiplies u"),
-        (dict(pde=lambda u, x, g: js.laplacian(u)(x) + u(x) ** 2 - g["q"], **one), "nonlinear in u"),
         (dict(pde=pde, unknowns={"q": 0.0}, constraints=[js.constraint(lambda s: s.u)]), "must return a real scalar"),
         (dict(pde=pde, unknowns={"q": 0.0}, constraints=[js.constraint(lambda s: s.nothing)]), "nothing"),
     ]  # fmt: skip

@@ -97,6 +97,13 @@ def test_strong_convection_is_no_worse(peclet):
     assert deep * 20 < flat
 
 
+@pytest.mark.parametrize("formulation", ["lsq", "loo"])
+def test_strong_convection_keeps_its_digits(formulation):
+    """A polynomial, all of whose error is round-off: parts of a tail by factors rounded apart made it 1e-9."""
+    turning = lambda v, x: jnp.array([0.5 - x[1], x[0] - 0.5]) @ js.grad(v)(x) - 1.5e-3 * js.laplacian(v)(x)
+    assert solved(turning, mm.polynomial(2, 4), depth=4, formulation=formulation)[1] < 1e-10
+
+
 def test_the_error_estimate_knows_deep_solutions():
     for operator in (poisson, helmholtz, diffusion):
         sol, error = solved(operator, wave, depth=4)

@@ -61,6 +61,16 @@ def test_an_integral_term_and_its_boundary_conditions():
     assert abs(js.solve(problem, ROD).unknowns["V"] - 1.0) < 2e-8
 
 
+def test_an_equation_of_the_second_kind_needs_no_conditions():
+    """u(x) - x times the integral of exp(-y) u(y) = exp(x) - x: u = exp(x), whose integral is one."""
+    ends = {"left": js.free(), "right": js.free()}
+    problem = js.Problem(lambda u, x: u(x) - jnp.exp(x[0]) + x[0], ends, integral=lambda x, y: -x[0] * jnp.exp(-y[0]))
+    sol = js.solve(problem, ROD)
+    # The weights of the particles are exact up to degree 6.
+    assert np.abs(sol.u - np.exp(ROD.points[:, 0])).max() < 1e-8 and sol.flags == []
+    assert abs(sol([[0.33]])[0] - np.exp(0.33)) < 1e-8
+
+
 def test_gradients_by_what_the_kernel_holds():
     def loss(p):
         kernel = lambda x, y, p: p["k"] * jnp.exp(-((x[0] - y[0]) ** 2) / p["w"])  # noqa: E731

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import jsmitsm as js
+from jsmitsm.solution.regions.flags import unlike_polynomials
 
 BOX = ((-1.0, -1.0), (1.0, 1.0))
 DISK = js.sdf.circle((0.0, 0.0), 0.5)
@@ -205,6 +206,41 @@ def test_an_elastic_inclusion_with_linear_displacements_is_exact():
     assert np.abs(sol.u - truth).max() < 1e-12
 
 
+@pytest.mark.parametrize("formulation", ["auto", "lsq"])
+def test_a_fluid_carries_heat_along_a_solid(formulation):
+    """Convection 200 times diffusion between neighbours: the fluid takes least squares, which quadratics pass."""
+    sides = {"in": lambda x: x[:, 0] < 1e-9, "out": lambda x: x[:, 0] > 1 - 1e-9, "rest": lambda x: x[:, 0] > -1}
+    half = {"solid": [(0, 0), (1, 0), (1, 0.5), (0, 0.5)], "fluid": [(0, 0.5), (1, 0.5), (1, 1), (0, 1)]}
+    cloud, k = js.regions(half, spacing=0.125, groups=sides), {"solid": 5.0, "fluid": 1.0}
+    exact = {"solid": lambda x: 1 + x[0] * x[1], "fluid": lambda x: x[0] ** 2 + x[1]}
+    wind = lambda u, x: 1600.0 * (x[1] - 0.5) * (1.5 - x[1]) * js.grad(u)(x)[0] - js.laplacian(u)(x)  # noqa: E731
+    pde = {"solid": laplace, "fluid": lambda u, x: wind(u, x) - wind(exact["fluid"], x)}
+    at = cloud.points[cloud.interfaces["solid|fluid"][:, 0]]
+    jump = jax.vmap(lambda x: exact["solid"](x) - exact["fluid"](x))(at)
+    between = js.interface(conduction(k), jump, lambda x: 5.0 * x[0] - 1.0)
+    truth = values(cloud, exact)
+    bcs = {n: js.dirichlet(truth[cloud.groups[n]]) for n in sides} | {"solid|fluid": between}
+    sol = js.solve(js.Problem(pde, bcs), cloud, order=2, formulation=formulation)
+    pairs = cloud.interfaces["solid|fluid"]
+    assert np.abs(sol.u - truth).max() < 1e-10 and sol.flags == []  # round-off in squares
+    assert np.abs(sol.u[pairs[:, 0]] - sol.u[pairs[:, 1]] - jump).max() < 1e-12
+    assert sol.stats["formulation"] == ({"solid": "loo", "fluid": "lsq"} if formulation == "auto" else "lsq")
+    # A layer within the spacing at a held outflow is told, as in one region.
+    hot = {"in": js.dirichlet(0.0), "out": js.dirichlet(1.0), "rest": js.neumann(0.0)}
+    hot |= {"solid|fluid": js.interface(conduction(k))}
+    told = js.solve(js.Problem({"solid": laplace, "fluid": wind}, hot), cloud, order=2, formulation=formulation)
+    assert any("no function fits the equation" in flag for flag in told.flags)
+
+
+def test_only_powers_are_singular():
+    """Around a point quadratic polynomials leave nothing of one, and much of r^0.39 in a quadrant."""
+    way = np.stack(np.meshgrid(np.arange(5.0), np.arange(5.0), indexing="ij"), axis=-1).reshape(-1, 2)[1:]
+    r, angle = np.linalg.norm(way, axis=1), np.arctan2(way[:, 1], way[:, 0])
+    for rise, least, most in ((way[:, 0] + 3 * way[:, 0] * way[:, 1], 0.0, 1e-12), (r**0.39 * np.cos(angle), 0.1, 1.0)):
+        left = np.abs(unlike_polynomials(way, rise[:, None])[r < 1.5]).max()
+        assert least <= left / np.abs(rise[r < 1.5]).max() <= most
+
+
 # ------------------------------------------------------------------ refusals
 
 
@@ -233,7 +269,16 @@ def test_conditions_are_never_guessed():
     turned = {"a": flux["a"], "b": lambda u, x, n: -2.0 * n @ js.grad(u)(x)}
     refused(r"opposite signs.*same n, which points from 'a' to 'b'", bcs={**ends, "a|b": js.interface(turned)})
     refused(r"method: III is not made for clouds of several regions", method="III")
-    refused(r"interfaces take equations of second order", pde={**both, "b": lambda u, x: js.partial(u, (4,))(x)})
+    free = {"boundary": js.free(), "a|b": good}
+    orders = {4: lambda u, x: js.partial(u, (4,))(x), 1: lambda u, x: js.grad(u)(x)[0], 0: lambda u, x: u(x) - 1.0}
+    for order, other in orders.items():
+        pde, bcs = {**both, "a": other}, None if order else free
+        refused(rf"of order {order}; interfaces bind values and fluxes of equations", pde=pde, bcs=bcs)
+    flow = lambda u, x: jnp.array([js.laplacian(u[0])(x) - js.grad(u[1])(x)[0], js.grad(u[0])(x)[0]])  # noqa: E731
+    force = dict.fromkeys("ab", lambda u, x, n: jnp.array([n @ js.grad(u[0])(x) - u[1](x), u[1](x)]))
+    with pytest.raises(ValueError, match="field 1, as a pressure, enters by fewer derivatives"):
+        held = {"boundary": js.dirichlet(0.0, field=0), "a|b": js.interface(force)}
+        js.solve(js.Problem(dict.fromkeys("ab", flow), held, fields=2), cloud)
     dot = js.sdf.circle((0.0, 0.0), 0.15)
     small = js.regions({"a": dot, "b": js.sdf.difference(js.sdf.rectangle(*BOX), dot)}, BOX, 0.1)
     refused(r"region 'a' is too small: .* particles are too few", cloud=small, order=8)
@@ -257,7 +302,7 @@ def test_factors_serve_other_sources_jumps_and_values():
         return js.Problem(pde, {"boundary": js.dirichlet(lambda x: q * x[0]), "a|b": between})
 
     k = {"a": 1.0, "b": 3.0}
-    ready = js.factorize(problem(1.0, k), cloud)
+    ready = js.factorize(problem(0.0, k), cloud)  # what is zero here need not be later
     # The same rows and factors: nothing differs but the order of sums.
     for other in (k, {"a": 1.0, "b": 5.0}):
         again, whole = ready.solve(problem(-3.0, other)), js.solve(problem(-3.0, other), cloud)

@@ -51,6 +51,16 @@ def test_greens_function_of_the_disk(boundary):
     assert abs(sol.flux("boundary") - 3.0) < 1e-5  # what the source gives leaves
 
 
+def test_a_regular_part_of_round_off_is_no_flag():
+    """With its own singular part for boundary values a source leaves nothing to solve for."""
+    log = lambda x: 0.5 * jnp.log((x - Y) @ (x - Y)) / (2 * jnp.pi)  # noqa: E731
+    own = js.dirichlet(jax.vmap(log)(DISK.points[DISK.groups["boundary"]]))
+    for given, told in ((own, 0), (js.dirichlet(0.0), 1)):
+        sol = js.solve(js.Problem(laplace, {"boundary": given}, sources=[js.point_source(Y)]), DISK, order=6)
+        sol._found = ["rough"]
+        assert len(sol.flags) == told
+
+
 def test_a_source_survives_pickling_and_jit():
     problem = js.Problem(laplace, {"boundary": js.dirichlet(0.0)}, sources=[js.point_source(Y)])
     sol = js.solve(problem, DISK)

@@ -62,6 +62,7 @@ class Regions:
     kernel: None = None
     part: None = None  # of a cloud that several processes share
     contrast: float = 1.0  # of the conductivities on both sides of an interface, the largest
+    squared: bool = False  # whether a region takes the least-squares form
 
     @property
     def rec(self) -> Recursion:
@@ -174,10 +175,17 @@ def _region(
                 f"cloud: the region {name!r} is too small: {text[7:]}; reduce the spacing there, or lower the order"
             ) from None
         raise ValueError(f"{text} (in the region {name!r})") from error
-    if max(disc.traced.order) > 2 and len(cloud.interfaces):
+    highest = max(disc.traced.order)
+    if highest != 2 and len(cloud.interfaces):
         raise ValueError(
-            f"pde[{name!r}]: of order {max(disc.traced.order)}; interfaces take equations of second order, write it as "
-            "a system of them"
+            f"pde[{name!r}]: of order {highest}; interfaces bind values and fluxes of equations of second order, "
+            + ("write it as a system of them" if highest > 2 else "give it a diffusion that the spacing resolves")
+        )
+    lower = [f for f, less in enumerate(disc.rec.weights) if less]
+    if lower and len(cloud.interfaces):
+        raise ValueError(
+            f"pde[{name!r}]: field {lower[0]}, as a pressure, enters by fewer derivatives than the equations that know "
+            "it, and interfaces bind a value and a flux of every field; such systems are made for one region"
         )
     if disc.scheme.n_data:
         raise ValueError(

@@ -12,14 +12,16 @@ from jsmitsm.cloud.regions.region_cloud import sides
 from jsmitsm.discretization.coefficients import Numbers, numbers, slot_series
 from jsmitsm.discretization.held_particles import with_held_expansions
 from jsmitsm.discretization.layout import Class, table
+from jsmitsm.discretization.least_squares import added_up
 from jsmitsm.discretization.leave_one_out import loads
 from jsmitsm.discretization.local_data import own_conditions, particles_first, right_sides, shared_elimination
 from jsmitsm.discretization.regions.layout import Meeting, Part, Regions
+from jsmitsm.discretization.regions.squares import squared_loads
 from jsmitsm.discretization.rows import all_coefficients
 from jsmitsm.equation.regions.between import Between
 from jsmitsm.particle import joint
 from jsmitsm.particle.joint import JointScheme, Side
-from jsmitsm.particle.moments import Row
+from jsmitsm.particle.moments import Block, Row
 from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.runtime.whole_program import in_one_program
 
@@ -297,15 +299,19 @@ def in_whole(part: Part, cls: Class) -> Class:
 
 
 def whole_right_side(
-    regions: Regions, nums: RegionNumbers, rows: list[tuple[list[Class], list[Row]]], bound: list[Any]
+    regions: Regions, nums: RegionNumbers, rows: list[tuple[list[Class], list[Any]]], bound: list[Any]
 ) -> Any:
     """The right-hand side (n,) of the whole system.
 
-    rows: classes and rows of every region, in its own numbers; bound: of the joints, as ``(joints, classes, rows)``.
+    rows: classes and rows of every region, in its own numbers, or blocks where it takes the least-squares form; bound:
+    of the joints, as ``(joints, classes, rows)``.
     """
     unknown = regions.unknowns
-    parts, places = [], []
+    parts, places, squares = [], [], []
     for part, own, (classes, made) in zip(regions.parts, nums.parts, rows):
+        if in_squares(made):
+            squares.append(squared_loads(regions, part, own, (classes, made)))
+            continue
         for cls, row in zip(classes, made, strict=True):
             source, given = right_sides(part.disc, own, cls)
             whole = in_whole(part, cls)
@@ -320,7 +326,18 @@ def whole_right_side(
             parts.append((row, source, given, cls.neighbours, np.flatnonzero(at >= 0)))
             places.append(at[at >= 0])
     none = np.zeros((len(regions.cloud), 0))
-    return loads(parts, nums.held, none, np.argsort(np.concatenate(places))) if parts else np.zeros(0)
+    found = loads(parts, nums.held, none, np.argsort(np.concatenate(places))) if parts else np.zeros(0)
+    if not squares:
+        return found
+    where, values = (sum((s[k] for s in squares), []) for k in (0, 1))
+    if parts:
+        where, values = [*where, np.sort(np.concatenate(places))], [*values, found]
+    return added_up(where, values, np.zeros(int(unknown.max(initial=-1)) + 1))
+
+
+def in_squares(made: list[Any]) -> bool:
+    """Whether what a region is made of are blocks of the least-squares form, and no rows."""
+    return bool(made) and isinstance(made[0], Block)
 
 
 def whole_coefficients(regions: Regions, nums: RegionNumbers, values: Any) -> Any:

@@ -77,5 +77,7 @@ def _peclet(rec: Recursion, traced: Traced, cloud: Cloud, params: Any, part: Par
     if is_traced(jac):
         return 0.0
     jac = np.asarray(jac)[0]
+    if not np.isfinite(jac).all():  # refused where the coefficients are used
+        return 0.0
     speed, diffusion = np.linalg.norm(jac[drift], axis=0), np.abs(jac[second]).max(axis=0)
     return float(np.median(speed * spacing / np.where(diffusion > 0, diffusion, np.inf)))

@@ -9,6 +9,8 @@ import numpy as np
 
 from jsmitsm.discretization.coefficients import Numbers
 from jsmitsm.discretization.layout import Discretization
+from jsmitsm.discretization.resolution.residuals import followed
+from jsmitsm.discretization.rows import all_coefficients
 from jsmitsm.equation.problem import Problem
 from jsmitsm.taylor.multi_indices import multi_indices
 
@@ -18,30 +20,35 @@ JUMP = 0.5
 CHUNK = 8192
 
 
-def steepness(disc: Discretization, nums: Numbers) -> np.ndarray:
+def steepness(disc: Discretization, nums: Numbers, problem: Problem, values: np.ndarray, most: float) -> np.ndarray:
     """By how much the coefficients at the nearest neighbours differ from the particles' Taylor polynomials, (N,).
 
     Each counts as it enters the recursion, scaled by the distance, in parts of the largest. Of degree 0 the
-    polynomials are constants.
+    polynomials are constants. No more than ``most`` where the solution follows the equation to the neighbour.
     """
     rec, jac = disc.rec, np.asarray(nums.jac, float)
     power = np.array([[rec.levels[e] - sum(b) - rec.weights[f] for f, b in rec.slots] for e in range(len(rec.levels))])
-    worst = np.zeros(len(disc.cloud))
+    worst, fitted = np.zeros(len(disc.cloud)), None
     for ids, here, there, offset in _pairs(disc, nums):
         length = np.linalg.norm(offset, axis=1) ** power[..., None]
         t = np.stack([np.prod(offset ** np.array(a), axis=1) for a in multi_indices(rec.dim, rec.degree)])
         away = np.abs(np.einsum("estn,tn->esn", jac[..., here], t) - jac[:, :, 0, there]) * length
         size = (np.maximum(np.abs(jac[:, :, 0, there]), np.abs(jac[:, :, 0, here])) * length).max(axis=1)
         part = (away.max(axis=1) / np.where(size > 0, size, 1.0)).max(axis=0)
+        bad = np.flatnonzero(part > most)
+        if len(bad):
+            fitted = np.asarray(all_coefficients(disc, nums, values)) if fitted is None else fitted
+            fine = followed(disc, problem, fitted, ids[bad], nums.ids[there[bad]], offset[bad])
+            part[bad[fine]] = most
         worst[ids] = np.maximum(worst[ids], part)
     return worst
 
 
-def unseen(disc: Discretization, nums: Numbers, problem: Problem) -> np.ndarray:
+def unseen(disc: Discretization, nums: Numbers, problem: Problem, values: np.ndarray) -> np.ndarray:
     """Which particles (N,) have a neighbour to which a leading coefficient jumps while both their slopes deny it.
 
     The recursion knows a coefficient by its derivatives at the particles: of such a jump it knows nothing, nor do the
-    rows of a higher order, and the solution is that of another problem.
+    rows of a higher order, and the solution is that of another problem; unless it follows the equation all the way.
     """
     rec, jac = disc.rec, np.asarray(nums.jac, float)
     found = np.zeros(len(disc.cloud), bool)
@@ -59,11 +66,15 @@ def unseen(disc: Discretization, nums: Numbers, problem: Problem) -> np.ndarray:
         if not disc.linear:
             return found
         jac = np.asarray(disc.traced.coefficients(np.asarray(disc.cloud.points)[nums.ids], 1, params=problem.params)[0])
-    slopes = jac[:, leading, 1 : 1 + rec.dim]
+    slopes, fitted = jac[:, leading, 1 : 1 + rec.dim], None
     for ids, here, there, offset, jumps in pairs:
         change = jac[:, leading, 0][..., there] - jac[:, leading, 0][..., here]
         told = 0.5 * np.einsum("esdn,nd->esn", slopes[..., here] + slopes[..., there], offset)
-        found[ids] |= (jumps & ((change - told) * np.sign(change) > 0.6 * np.abs(change))).any(axis=(0, 1))
+        bad = np.flatnonzero((jumps & ((change - told) * np.sign(change) > 0.6 * np.abs(change))).any(axis=(0, 1)))
+        if len(bad):
+            fitted = np.asarray(all_coefficients(disc, nums, values)) if fitted is None else fitted
+            lost = ~followed(disc, problem, fitted, ids[bad], nums.ids[there[bad]], offset[bad])
+            found[ids[bad[lost]]] = True
     return found
 
 

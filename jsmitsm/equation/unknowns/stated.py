@@ -71,6 +71,15 @@ def at(plain: Problem, unknowns: Any, carried: Any = None) -> Problem:
     )  # fmt: skip
 
 
+def begun(problem: Problem, u0: Any) -> Any:
+    """A user's start, a function of (x[, params]) or an array, as one of the plain problem's."""
+    extras = problem.extras
+    if not callable(u0) or extras is None or not (extras.unknowns or extras.kernels):
+        return u0
+    given = problem.params is not None
+    return lambda x, parts: u0(x, *([parts[0]] if given else []))
+
+
 def floats(unknowns: Any) -> dict[str, Any]:
     return {name: jnp.asarray(value, float) for name, value in unknowns.items()}
 

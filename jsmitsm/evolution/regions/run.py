@@ -6,13 +6,13 @@ import time
 from types import SimpleNamespace
 from typing import Any
 
-import jax
 import numpy as np
 
 from jsmitsm.discretization.regions.pencil import assemble_regions_pencil
 from jsmitsm.evolution.regions.semidiscrete import RegionsSemidiscrete
 from jsmitsm.evolution.run import Run
 from jsmitsm.evolution.space.convection import refuse_convection
+from jsmitsm.runtime.tracers import computed
 
 
 class RegionsRun(Run):
@@ -30,7 +30,7 @@ class RegionsRun(Run):
         began = time.perf_counter()
         massed = np.any([part.sourced for part in self.timed.parts.values()], axis=0)
         self.counts["pencils"] += 1
-        with jax.ensure_compile_time_eval():
+        with computed():
             semi = self._semidiscrete(t, self.order, massed, self.stencils)
         if not self.traced:
             self._refuse_convection()

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from jsmitsm.discretization.pencil.fits import local_fits
+from jsmitsm.discretization.supports import Part
 from jsmitsm.equation.field import unit
 from jsmitsm.evolution.space.semidiscrete import Semidiscrete
 
@@ -16,8 +17,11 @@ MODERATE, MOST = 2.0, 5.0
 DIVERGENT = 0.1
 
 
-def refuse_convection(semi: Semidiscrete, flags: list[str]) -> None:
-    """ValueError where convection outweighs diffusion between neighbours; a flag where it comes near."""
+def refuse_convection(semi: Semidiscrete, flags: list[str], part: Part | None = None) -> None:
+    """ValueError where convection outweighs diffusion between neighbours; a flag where it comes near.
+
+    part: of a cloud that several processes share, which find the same.
+    """
     operator, problem = semi.timed.operator, semi.timed.problem
     whole = semi.timed.space
     for e, row in enumerate(whole.pattern):
@@ -31,7 +35,7 @@ def refuse_convection(semi: Semidiscrete, flags: list[str]) -> None:
     if semi.second or not len(operator.slots) or max(operator.order) != 2:
         return
     points = np.asarray(semi.points)
-    spacing = float((np.prod(np.ptp(points, axis=0)) / len(points)) ** (1.0 / points.shape[1]))
+    spacing = part.spacing if part else float((np.prod(np.ptp(points, axis=0)) / len(points)) ** (1 / points.shape[1]))
     jac, _ = operator.coefficients(points, 0, params=problem.params)
     worst = 0.0
     for e in range(semi.fields):
@@ -47,6 +51,7 @@ def refuse_convection(semi: Semidiscrete, flags: list[str]) -> None:
         diffusion = diffusion / np.sqrt(points.shape[1])
         with np.errstate(divide="ignore", invalid="ignore"):
             worst = max(worst, float(np.nanmax(np.where(speed > 0, speed * spacing / diffusion, 0.0))))
+    worst = part.largest({"": worst})[""] if part else worst  # type: ignore[dict-item,assignment]
     if worst > MOST:
         raise ValueError(
             f"pde: between neighbouring particles convection is {worst:.3g} times the diffusion (|v| h / eps, the cell "

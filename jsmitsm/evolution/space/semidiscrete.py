@@ -23,6 +23,8 @@ from jsmitsm.runtime.tracers import any_number, concrete, is_traced
 
 # Steps from which on those to come are looked at together, and the numbers that this may take at a time.
 MANY, NUMBERS = 64, 4e6
+# A start may differ from what is held by this part of its size.
+ROUND_OFF = 1e-13
 
 
 class Semidiscrete:
@@ -211,6 +213,19 @@ class Semidiscrete:
             flat = np.zeros(self.n * self.fields)
             flat[self.free], flat[self.held] = part, held
         return centred(flat.reshape(self.n, self.fields)[self.disc.partner], self.floating)
+
+    def kept(self, part: Any, held: Any) -> Any:
+        """What of a state is kept: all values."""
+        return self.placed(part, held)
+
+    def begun(self, start: tuple[Any, ...], t: float) -> tuple[Any, Any, bool]:
+        """The state of a start ((N, F),), or with rates; the held values' part of E in it; whether that jumps."""
+        flat = [np.asarray(v).reshape(-1) for v in start]
+        asked = self.system.force(self.masses_held[-1].host @ flat[-1][self.held])
+        gap = np.abs(flat[0][self.held] - np.asarray(self.sample(np.asarray(t))[0])).max(initial=0.0)
+        scale = max(float(np.abs(v).max(initial=0.0)) for v in flat)
+        jumps = bool(gap > ROUND_OFF * scale) and self.masses_held[-1].values.size > 0
+        return np.concatenate([v[self.free] for v in flat]), asked, jumps
 
     @property
     def floating(self) -> int | None:

@@ -10,6 +10,7 @@ import numpy as np
 from jsmitsm.discretization.pencil.sparse import Sparse, combined
 from jsmitsm.evolution.space.factors import ComplexFactor, RealFactor
 from jsmitsm.linear import linsolve
+from jsmitsm.linear.sparse import Factor
 from jsmitsm.runtime.tracers import is_traced
 
 
@@ -83,6 +84,22 @@ class System:
     def factorisations(self) -> int:
         return len(self._factors)
 
+    def inverse(self, parts: list[tuple[Any, Any]], h: Any, kept: bool = True) -> tuple[Any, Any]:
+        """The entries of a sum of factor * matrix, and what solves with it; None where the entries are traced.
+
+        kept: among the factors of the package, for the next one that asks for the same.
+        """
+        entries = combined(parts)
+        if is_traced(entries[0]):
+            return entries, None
+        if not kept:
+            return entries, Factor(*entries, self.n, self.points, "sparse", False, 0)
+        return entries, (ComplexFactor if isinstance(h, complex) else RealFactor)(entries, self.n, self.points)
+
+    def largest(self, x: Any) -> float:
+        """The largest size of a value, NaN where one is none."""
+        return float(np.abs(x).max(initial=0.0))
+
     def undriven(self) -> np.ndarray:
         """The equations (size,) without any rate: what holds at every moment."""
         m = self.masses[-1]
@@ -105,13 +122,7 @@ class Resolvent:
         parts = [(1.0, system.masses[-1]), (h if not system.second else h * h, system.stiffness)]
         if system.second:
             parts.append((h, system.masses[0]))
-        self.entries, n = combined(parts), system.n
-        if is_traced(self.entries[0]):
-            self._factor: Any = None
-        elif isinstance(h, complex):
-            self._factor = ComplexFactor(self.entries, n, system.points)
-        else:
-            self._factor = RealFactor(self.entries, n, system.points)
+        self.entries, self._factor = system.inverse(parts, h)
 
     def _inner(self, r: Any, transpose: bool) -> Any:
         if self._factor is not None and not is_traced(r):

@@ -38,7 +38,7 @@ class InTime:
             before = system.resolvent(stepper.smallest(h)).solve(system.mass(before))
         self._sum = weight * step.error + (0.0 if before is None else before)
         self.times.append(t)
-        self.sizes.append(float(np.abs(self._sum[: system.n]).max(initial=0.0)))
+        self.sizes.append(system.largest(self._sum[: system.n]))
 
     def at(self, times: np.ndarray) -> np.ndarray:
         """The size of the error at some times."""

@@ -6,10 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from jsmitsm.discretization.pencil.sparse import Sparse, combined
+from jsmitsm.discretization.pencil.sparse import Sparse
 from jsmitsm.evolution.space.semidiscrete import Semidiscrete
 from jsmitsm.evolution.steps.stepping import Stopped
-from jsmitsm.linear.sparse import Factor
 from jsmitsm.runtime.errors import SolveError
 
 # Corrections at the most; a correction must shrink to this part of the last, or the matrix is made anew.
@@ -28,12 +27,12 @@ class Newton:
         self.counts = {"iterations": 0, "factorisations": 0}
 
     def __call__(self, r: np.ndarray, guess: np.ndarray, t: float, g: float, known: np.ndarray) -> np.ndarray:
-        semi, y = self.semi, guess
+        semi, y, largest = self.semi, guess, self.semi.system.largest
         before, fresh = np.inf, False
         for _ in range(MOST):
             with np.errstate(all="ignore"):
                 misfit = semi.system.mass(y) + g * (semi.system.stiff(y) - semi.explicit(y, t, known)) - r
-            if not np.isfinite(misfit).all():
+            if not np.isfinite(largest(misfit)):
                 break
             if self._factor is None or g != self._g:
                 self._prepare(y, t, g, known)
@@ -41,7 +40,7 @@ class Newton:
             change = self._factor.solve(misfit)
             y = y - change
             self.counts["iterations"] += 1
-            size = float(np.abs(change).max(initial=0.0)) / max(float(np.abs(y).max(initial=0.0)), 1e-300)
+            size = largest(change) / max(largest(y), 1e-300)
             if size <= SOLVED or (size <= 1e-8 and size >= 0.5 * before):  # round-off is reached
                 return y
             if size > SLOW * before and not fresh:
@@ -82,9 +81,9 @@ class Newton:
         system = semi.system
         extra = (g * semi.linearised(semi.steepness(semi.placed(y, known), t))).tocoo()
         more = Sparse(extra.data, extra.coords[0], extra.coords[1], extra.shape)
-        values, rows, cols = combined([(1.0, system.masses[0]), (g, system.stiffness), (1.0, more)])
         try:
-            self._factor = Factor(values, rows, cols, system.n, system.points, "sparse", False, 0)
+            parts = [(1.0, system.masses[0]), (g, system.stiffness), (1.0, more)]
+            _, self._factor = system.inverse(parts, g, kept=False)
         except SolveError as fault:
             raise Stopped(f"the stage's system at t = {t:.6g} cannot be solved: {fault}") from fault
         self._g = g

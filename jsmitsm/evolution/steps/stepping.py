@@ -99,7 +99,7 @@ class Stepper:
                 y = resolvent.solve(r)
             else:
                 y = self.newton(r, now.y, at, h * s.gamma, known[i - 1])
-            _refuse_blown(y, at)
+            _refuse_blown(system, y, at)
             now = self._ended(y, at, force[i - 1], held[i - 1], known[i - 1])
             stages.append(y)
             slopes.append(now.slope)
@@ -145,7 +145,7 @@ class RadauStepper:
         z1 = system.resolvent(h / pair).solve((h / pair) * turned[1])
         z = np.multiply.outer(r.vectors[:, 0].real, z0) + 2.0 * np.multiply.outer(r.vectors[:, 1], z1).real
         y = last.y + z[-1]
-        _refuse_blown(y, t + h)
+        _refuse_blown(system, y, t + h)
         slope = force[-1] - system.stiff(y)
         slope[self.still] = 0.0
         now = Step(y, force[-1], held[-1], known[-1], slope, None, [last.y + v for v in z])
@@ -155,6 +155,6 @@ class RadauStepper:
         return now
 
 
-def _refuse_blown(y: np.ndarray, t: float) -> None:
-    if not np.isfinite(y).all():
+def _refuse_blown(system: System, y: np.ndarray, t: float) -> None:
+    if not np.isfinite(system.largest(y)):
         raise Stopped(f"the solution is no longer finite at t = {t:.6g}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,8 @@ from jsmitsm.solution.arguments import Depth
 
 # Values sought beyond those asked for, the residual that ends the search, and its longest.
 MORE, SETTLED, MOST = 6, 1e-13, 500
+# Values of another order that are asked for besides, since some may have changed places.
+BESIDE = 2
 
 
 class ParallelModes(OfOwn):
@@ -43,9 +46,10 @@ class ParallelModes(OfOwn):
         Seconds, sizes.
     """
 
-    def __init__(self, values: np.ndarray, u: np.ndarray, residuals: np.ndarray, local: Local, stats: dict[str, Any]):
+    def __init__(self, values: np.ndarray, u: np.ndarray, residuals: np.ndarray, local: Local, stats: dict[str, Any],
+                 again: Callable[[int, int], np.ndarray]):  # fmt: skip
         self.values, self.residuals, self.stats = values, residuals, stats
-        self._u, self._local = u, local
+        self._u, self._local, self._again = u, local, again
 
     @property
     def u(self) -> np.ndarray:
@@ -80,8 +84,8 @@ def eigen(
     Returns
     -------
     ParallelModes
-        Values, and the modes at every process's particles. Estimates, derivatives and values between the particles
-        are those of ``js.eigen`` alone.
+        Values, and the modes at every process's particles; ``jp.error_estimate`` takes them. Derivatives and values
+        between the particles are those of ``js.eigen`` alone.
 
     Raises
     ------
@@ -117,7 +121,7 @@ def eigen(
         stiff, inert = pencil.A.part(pencil.free, pencil.free), weighted(problem, pencil, weights)
     a, c = own_rows(local, stiff), own_rows(local, inert)
     made = time.perf_counter()
-    values, vectors, residuals = _found(us, a, c, count, float(near), 10.0 ** -(order / 2 + 1))
+    values, vectors, residuals = _found(us, a, c, count, float(near), _together(order))
     u = np.zeros((*local.disc.held[local.halo.ids].shape, len(values)), vectors.dtype)
     u[~local.disc.held[local.halo.ids]] = _normalised(us, vectors, slab.count, local.first)
     end = time.perf_counter()
@@ -126,7 +130,31 @@ def eigen(
         "processes": us.size, "depth": local.disc.rec.depth,
         "seconds": {"local": made - began, "modes": end - made, "total": end - began},
     }  # fmt: skip
-    return ParallelModes(values, np.swapaxes(u, 1, 2), residuals, local, stats)
+
+    def again(order: int, count: int) -> np.ndarray:
+        """So many values by another order."""
+        return eigen(problem, ParallelCloud(slab), count, near=near, mass=mass, order=order, depth=depth).values
+
+    return ParallelModes(values, np.swapaxes(u, 1, 2), residuals, local, stats, again)
+
+
+def errors(modes: ParallelModes) -> np.ndarray:
+    """Estimated errors (k,) of the values: how far those of order p + 2, or of p - 2, are away; see error_estimate."""
+    order, values = modes._local.settings.order, modes.values
+    for other in (order + 2, order - 2):
+        try:
+            found = modes._again(other, min(len(values) + BESIDE, modes.stats["unknowns"]))
+        except (ValueError, SolveError):  # too high or too low an order, too few particles
+            continue
+        away = np.abs(values[:, None] - found).min(axis=1)
+        near = np.abs(values[:, None] - values) <= _together(order) * np.abs(values)[:, None]
+        return np.where(near, away, 0.0).max(axis=1)
+    return np.full(len(values), np.inf)
+
+
+def _together(order: int) -> float:
+    """Values whose relative distance is below this may be one, parted by the discretisation."""
+    return float(10.0 ** -(order / 2 + 1))
 
 
 def _found(

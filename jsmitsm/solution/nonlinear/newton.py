@@ -24,7 +24,7 @@ from jsmitsm.runtime.progress import bar
 from jsmitsm.runtime.tracers import concrete, is_traced
 from jsmitsm.solution.nonlinear.damped import DONE, GOOD, MOST, Found, damped
 from jsmitsm.solution.nonlinear.start import harmonic, start
-from jsmitsm.solution.nonlinear.steps import Iterate, Record, advance, distance, raising, relaxed
+from jsmitsm.solution.nonlinear.steps import Iterate, Record, advance, raising, relaxed
 from jsmitsm.solution.run import Run
 
 # Under jit, where no condition is known, steps below STALLED that do not fall are taken to be round-off.
@@ -50,13 +50,14 @@ def newton(run: Run, u0: Any) -> tuple[Any, Any, Any, Any]:
     else:
         with bar("Newton steps") as shown:
             record = Record(run, shown)
-            (values, taylor), _, good, _ = _searched(record, here.numbers(), one.numbers())
+            found = _searched(record, here.numbers(), one.numbers())
+        values, taylor, good = found.at.values, found.at.taylor, found.good
         run.changes = record.changes
         steps, rate = record.steps, record.rate
     refuse_jumps_at(run, values, taylor)
     if is_traced(one):
-        for _ in range(_repeats(rate)):
-            values, taylor = advance(run, taylor)
+        for _ in range(repeats(rate)):
+            values, taylor, _ = advance(run, taylor)
     return values, taylor, good, steps
 
 
@@ -71,7 +72,7 @@ def refuse_jumps_at(run: Run, values: Any, taylor: Any) -> None:
         refuse_jumps(disc, disc.problem, (jnp if is_traced(given) else np).stack(given))
 
 
-def _repeats(rate: float) -> int:
+def repeats(rate: float) -> int:
     """Steps after which the derivative's error, contracted by ``rate`` each, is below 1e-9."""
     return int(np.clip(math.ceil(math.log(1e-9) / math.log(min(max(rate, 1e-12), 0.5))), 2, 20))
 
@@ -122,7 +123,7 @@ def _searched(record: Record, begin: Iterate, first: Iterate) -> Found:
         best = _without_depth(record, begin) or best
         if not record.run.disc.rec.depth:
             return best
-    for name, search in (("pseudo-time steps", _in_pseudo_time), ("full steps", _wandering)):
+    for name, search in (("pseudo-time steps", _in_pseudo_time), ("full steps", wandering)):
         if best.good:
             break
         ways.append(name)
@@ -131,7 +132,7 @@ def _searched(record: Record, begin: Iterate, first: Iterate) -> Found:
         if near is not None and step is not None:
             best = min(best, damped(record, near, step), key=lambda found: (not found.good, found.change))
     if not best.good:
-        refuse_jumps_at(record.run, *best.at)
+        refuse_jumps_at(record.run, best.at.values, best.at.taylor)
         record.run.fail(
             f"Newton's method did not converge: {', '.join(ways)} were tried, {record.solves} linear solves, and the "
             f"next one would still change u by {best.change:.1e} of its size; start nearer (u0), approach the "
@@ -190,7 +191,7 @@ def _in_pseudo_time(record: Record, begin: Iterate, first: Iterate) -> Iterate |
     return near if near is not None or known.all() else relaxed(record, begin, WARY * scales)
 
 
-def _wandering(record: Record, begin: Iterate, first: Iterate) -> Iterate | None:
+def wandering(record: Record, begin: Iterate, first: Iterate) -> Iterate | None:
     """Full steps, whatever their length: near singular matrices they are long and lead far, and come back."""
     here, target = begin, first
     for _ in range(WANDERING):
@@ -198,7 +199,7 @@ def _wandering(record: Record, begin: Iterate, first: Iterate) -> Iterate | None
         if after is None:
             return None
         here, target = target, after
-        length = distance(target, here)
+        length = record.distance(target, here)
         record.went(length, target.size)
         if length <= NEAR * target.size:
             return target
@@ -214,7 +215,7 @@ def _compiled(run: Run, here: Iterate) -> tuple[Any, Any, Any, Any]:
 
     def step(carry):
         values, taylor, before, _, steps = carry
-        new, taylor = jax.lax.stop_gradient(advance(run, taylor))
+        new, taylor, _ = jax.lax.stop_gradient(advance(run, taylor))
         change = jnp.max(jnp.abs(new - values)) / jnp.maximum(jnp.max(jnp.abs(new)), 1e-300)
         return new, taylor, change, before, steps + 1
 

@@ -40,10 +40,11 @@ MOVES, FEW = 0.3, 0.03
 
 
 class Iterate(NamedTuple):
-    """Values (N, F) and expansions (N, F, K)."""
+    """Values (N, F), expansions (N, F, K), and the global unknowns (G,) of a problem that has some."""
 
     values: Any
     taylor: Any
+    unknowns: Any = np.zeros(0)
 
     def toward(self, target: Iterate, part: float) -> Iterate:
         """A part of the way; what is linear and holds of both ends holds of it too."""

@@ -39,7 +39,7 @@ class RegionsFactorization(KeptMatrix):
 
     def __init__(self, problem: Any, cloud: Any, **options: Any):
         self._options = options
-        self._run = prepared_regions(problem, cloud, **options)
+        self._run = prepared_regions(problem, cloud, sources=True, **options)
         if not self._run.disc.linear:
             raise ValueError("problem: it is nonlinear, so its matrix changes in every step; use js.solve")
         self._nums = self._run.numbers()
@@ -67,11 +67,12 @@ class RegionsFactorization(KeptMatrix):
             As ``js.solve`` does.
         """
         old = self._run.disc
-        disc = discretize_regions(problem, old.cloud, old.rec.order, old.rec.depth, whole_table(old), sources=False)
+        disc = discretize_regions(problem, old.cloud, old.rec.order, old.rec.depth, whole_table(old), sources=True)
         if not np.array_equal(disc.held, old.held) or [p.disc.scheme for p in disc.parts] != [
             p.disc.scheme for p in old.parts
         ]:
             refuse_other()
+        disc.contrast, disc.squared = old.contrast, old.squared
         nums = region_numbers(disc)
         if not same_matrix(nums, self._nums):
             return RegionsFactorization(problem, old.cloud, **self._options).solve(problem)

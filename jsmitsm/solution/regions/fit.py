@@ -68,7 +68,7 @@ class RegionsFit:
                 "on the host; ask for it outside the transform"
             )
         regions = discretize_regions(self.problem, self.cloud, order, self.recipe.depth)
-        run, taylor = RegionsRun(regions, "auto", True, True), self.taylor
+        run, taylor = RegionsRun(regions, "auto", True, True, self.recipe.formulation), self.taylor
         if taylor is not None:
             more = len(multi_indices(regions.rec.dim, regions.rec.reach)) - taylor.shape[2]
             taylor = (jnp if is_traced(taylor) else np).pad(taylor, ((0, 0), (0, 0), (0, more)))

@@ -28,8 +28,6 @@ def prepared_regions(
     check(problem, cloud, method, order, kernel, stencils, formulation, solver, u0, throw, depth)
     if method != "S":
         raise ValueError(f'method: {method} is not made for clouds of several regions; use "S"')
-    if formulation == "lsq":
-        raise ValueError('formulation: "lsq" is not made for clouds of several regions; use "loo"')
     for name, value in (("kernel", kernel), ("basis_terms", basis_terms)):
         if value is not None:
             raise ValueError(f"{name}: not made for clouds of several regions; leave it out")
@@ -42,7 +40,7 @@ def prepared_regions(
             "stencils = js.stencils(cloud, size=...) before the transform and pass stencils=stencils to solve"
         )
     disc = discretize_regions(problem, cloud, order, depth, near, sources=sources)
-    run = kind(disc, solver, throw, near is None)
+    run = kind(disc, solver, throw, near is None, formulation)
     run.began, run.seconds["set-up"] = start, time.perf_counter() - start
     if disc.held.all():
         raise ValueError("problem: every particle's value is held; nothing is left to solve for")
@@ -70,4 +68,4 @@ def finished_regions(run: RegionsRun, values: Any, taylor: Any, good: Any, itera
 
 def regions_recipe(run: RegionsRun) -> Recipe:
     rec = run.disc.rec
-    return Recipe("S", rec.order, None, "loo", rec.fields, rec.depth, tuple(rec.orders))
+    return Recipe("S", rec.order, None, run.form, rec.fields, rec.depth, tuple(rec.orders))

@@ -65,7 +65,7 @@ class Bordered(Run, ABC):
         data, r, c, b = super().assembled(nums, parts)
         if self.term is None:
             return data, r, c, b
-        if self.formulation == "lsq":
+        if self.formulation == "lsq" or getattr(self.disc, "squared", False):
             raise ValueError(
                 "integral: the equation takes the least-squares form, for which integral terms are not made; say "
                 'formulation="loo" where information does not travel'
@@ -118,8 +118,17 @@ class Bordered(Run, ABC):
         """The right-hand side (n,) without what an integral term adds."""
 
     @abstractmethod
-    def fit(self, unknowns: dict[str, Any], values: Any, recipe: Recipe) -> Any:
+    def fit(self, unknowns: dict[str, Any], values: Any, recipe: Recipe, taylor: Any = None) -> Any:
         """What fits the local polynomials of values that belong to these unknowns."""
+
+    @abstractmethod
+    def plain(self) -> Run:
+        """A run of the problem for its unknowns as they are, without constraints."""
+
+    def go(self, unknowns: dict[str, Any], values: Any = None) -> None:
+        """Become the run of the problem with other unknowns."""
+        self.disc = self.moved(unknowns, values)
+        self.problem = self.disc.problem
 
     def constants(self) -> np.ndarray:
         """Columns of ones (n, K) for the fields that are free up to a constant."""
@@ -175,9 +184,12 @@ class BorderedRun(Bordered):
     def sources_alone(self, nums: Numbers, make: Any) -> Numbers:
         return _alone(nums, make(None, self.disc.cloud.points[nums.ids], self.disc.rec))
 
-    def fit(self, unknowns: dict[str, Any], values: Any, recipe: Recipe) -> Fit:
+    def fit(self, unknowns: dict[str, Any], values: Any, recipe: Recipe, taylor: Any = None) -> Fit:
         disc = self.disc
-        return Fit(self.at(unknowns, values), disc.cloud, disc.kernel, table(disc), None, recipe)
+        return Fit(self.at(unknowns, values), disc.cloud, disc.kernel, table(disc), taylor, recipe)
+
+    def plain(self) -> Run:
+        return Run(self.disc, self.problem, self.solver, True, self.repair, self.formulation)
 
 
 class BorderedRegionsRun(Bordered, RegionsRun):
@@ -202,8 +214,11 @@ class BorderedRegionsRun(Bordered, RegionsRun):
         between = {name: (coef, np.zeros(np.shape(value))) for name, (coef, value) in nums.between.items()}
         return RegionNumbers(parts, between, np.zeros(np.shape(nums.held)))
 
-    def fit(self, unknowns: dict[str, Any], values: Any, recipe: Recipe) -> RegionsFit:
-        return RegionsFit(self.at(unknowns, values), self.disc.cloud, whole_table(self.disc), None, recipe)
+    def fit(self, unknowns: dict[str, Any], values: Any, recipe: Recipe, taylor: Any = None) -> RegionsFit:
+        return RegionsFit(self.at(unknowns, values), self.disc.cloud, whole_table(self.disc), taylor, recipe)
+
+    def plain(self) -> Run:
+        return RegionsRun(self.disc, self.solver, True, self.repair, self.form)
 
 
 def _alone(nums: Numbers, source: Any) -> Numbers:

@@ -1,4 +1,4 @@
-"""Solve a linear problem with constraints: the bordered system, in Newton steps where a constraint is not linear."""
+"""Solve a problem with constraints: the bordered system, in Newton steps where something is not linear."""
 
 from __future__ import annotations
 
@@ -14,25 +14,23 @@ import numpy as np
 from jsmitsm.discretization.leave_one_out import with_held
 from jsmitsm.equation.problem import Problem
 from jsmitsm.equation.unknowns.stated import floats
-from jsmitsm.runtime.errors import IN_FUNCTIONS, in_words
 from jsmitsm.runtime.progress import bar
 from jsmitsm.runtime.tracers import concrete, is_traced
 from jsmitsm.solution.fit import Fit, Recipe
 from jsmitsm.solution.regions.fit import RegionsFit
 from jsmitsm.solution.unknowns.bordered import Bordered, BorderedRegionsRun
-from jsmitsm.solution.unknowns.solution import (
-    ConstrainedRegionsSolution,
-    ConstrainedSolution,
-    Probe,
-    RegionsProbe,
-    WithUnknowns,
-)
+from jsmitsm.solution.unknowns.joint_newton import joint_newton
+from jsmitsm.solution.unknowns.lines import Lines
+from jsmitsm.solution.unknowns.solution import ConstrainedRegionsSolution, ConstrainedSolution, WithUnknowns
 from jsmitsm.taylor.multi_indices import HIGHEST
 
-# A constraint is met when it misses by this part of what it is made of; round-off of the fits leaves 1e-12.
-MET, STEPS = 1e-9, 20
+# Steps of Newton's method for constraints that are not linear.
+STEPS = 20
 # An unknown enters linearly if twice as much of it does twice as much, up to round-off.
 LINEAR = 1e-9
+
+# (order, unknowns, values of a nonlinear problem or None) -> the values at another order, which begins there.
+Again = Callable[[int, dict[str, Any], Any], Any]
 
 
 class Compared:
@@ -74,94 +72,112 @@ class Response:
 
 
 def solve_constrained(
-    problem: Problem, run: Bordered, recipe: Recipe, again: Callable[[int], Any]
+    problem: Problem, run: Bordered, recipe: Recipe, again: Again, u0: Any = None
 ) -> WithUnknowns:
     """The solution of a problem with constraints, from the run of its plain problem.
 
     recipe: of the solution, once the run has assembled; again: the values at another order.
     """
     assert problem.extras is not None
-    constraints, start = problem.extras.constraints, floats(problem.extras.unknowns)
+    start = floats(problem.extras.unknowns)
     _check(problem, run)
-    disc, names, several = run.disc, list(start), isinstance(run, BorderedRegionsRun)
     if run.term is not None:
-        run.term.weigh(disc.cloud, recipe.order)
+        run.term.weigh(run.disc.cloud, recipe.order)
         run.solver = "dense" if run.solver == "auto" else run.solver
-    run.multipliers = not names and run.term is None
-    answer = _response(run, start)
+    run.multipliers = not start and run.term is None
+    answer = _response(run, start) if run.disc.linear else None
     recipe = replace(recipe, formulation=run.formulation)
-    if not constraints:
+    lines = Lines(problem, run, recipe)
+    if answer is None:
+        return _jointly(run, lines, start, recipe, again, u0)
+    if not lines.constraints:
         x, good = _solved(run, answer)
-        return _finished(run, answer, start, start, with_held(disc, answer.nums, x), good, 1, recipe, again)
+        return _finished(run, start, with_held(run.disc, answer.nums, x), None, good, 1, recipe, again)
+    unknowns, values, good, steps = _linearly(run, lines, answer, start)
+    if start:
+        linearly = _entered_linearly(run, answer, start, unknowns)
+        if concrete(linearly) is not None and not bool(concrete(linearly)):
+            run.go(start)
+            return _jointly(run, lines, start, recipe, again, u0)
+        good = good & linearly
+    return _finished(run, unknowns, values, None, good, steps, recipe, again)
 
-    def missed(values: Any, unknowns: Any) -> Any:
-        """By how much the constraints (K,) are missed."""
-        made: Any = RegionsProbe if several else Probe
-        probe = made(values, disc.cloud, recipe, run.fit(unknowns, values, recipe), True, 1, {}, unknowns=unknowns)
-        return jnp.stack([_value(c, probe, k) for k, c in enumerate(constraints)])
 
+def _linearly(run: Bordered, lines: Lines, answer: Response, start: dict[str, Any]) -> tuple[Any, Any, Any, int]:
+    """Unknowns, values, whether the constraints are met, and the steps; equation and conditions are linear in both."""
+    disc, names, count = run.disc, lines.names, len(lines.constraints)
     run.columns = run.constants() if run.multipliers else -answer.columns
     free = np.flatnonzero(~disc.held.reshape(-1))
     # Linear constraints do not care where they are linearised; others must not have a flat spot there.
     unknowns, values, good = start, with_held(disc, answer.nums, np.ones(len(free))), True
     for step in range(1, STEPS + 1):  # noqa: B007
-        rest, pull = jax.vjp(missed, jnp.asarray(values, float), unknowns)
-        slopes = [pull(row) for row in np.eye(len(constraints))]
-        by_value = jnp.stack([v.reshape(-1) for v, _ in slopes])  # (K, N F)
-        by_unknown = jnp.stack([jnp.stack([g[n] for n in names]) for _, g in slopes]) if names else jnp.zeros((1, 0))
-        lines = _of_free(disc, by_value)
+        rest, by_value, by_unknown = lines.slopes(values, unknowns)
         away = jnp.stack([unknowns[n] - start[n] for n in names]) if names else jnp.zeros(0)
         # The constraints are written about u = the held values at the start, g = the start.
         moved = by_value @ (with_held(disc, answer.nums, np.zeros(len(free))) - values).reshape(-1) - by_unknown @ away
         corner = by_unknown + by_value @ answer.held.reshape(len(names), -1).T if names else None
-        run.lines, run.right = _host(lines), _host(-(rest + moved))
-        run.corner = np.zeros((len(constraints),) * 2) if corner is None else _host(corner)
+        run.lines, run.right = _host(lines.of_free(by_value)), _host(-(rest + moved))
+        run.corner = np.zeros((count,) * 2) if corner is None else _host(corner)
         x, well = _solved(run, answer)
         if names:
             unknowns = {n: start[n] + run.extra[k] for k, n in enumerate(names)}
         change = sum((answer.held[k] * (unknowns[n] - start[n]) for k, n in enumerate(names)), 0.0)
         values = with_held(disc, answer.nums, x) + change
-        rest = missed(values, unknowns)
-        size = abs(by_value) @ abs(values).reshape(-1) + sum(
-            (abs(by_unknown[:, k] * unknowns[n]) for k, n in enumerate(names)),
-            abs(jnp.stack([jnp.asarray(c.value, float) for c in constraints])),
-        )
-        met = jnp.all(abs(rest) <= MET * jnp.where(size > 0, size, 1.0))
+        rest = lines.missed(values, unknowns)
+        met = lines.met(rest, by_value, by_unknown, values, unknowns)
         good = good & well
         if concrete(met) is None or bool(concrete(met)) or not bool(concrete(jnp.isfinite(rest).all())):
             break
-    return _finished(run, answer, start, unknowns, values, good & met, step, recipe, again)
+    if not is_traced(values, unknowns, met):
+        told = f"the constraints are not met after {step} step(s) of Newton's method; are they possible?"
+        if not (bool(good) and bool(met)) and not run.failed and np.isfinite(values).all():
+            run.fail(told)
+    return unknowns, values, good & met, step
 
 
-def _finished(run, answer, start, unknowns, values, good, steps, recipe, again) -> WithUnknowns:
+def _jointly(
+    run: Bordered, lines: Lines, start: dict[str, Any], recipe: Recipe, again: Again, u0: Any
+) -> WithUnknowns:
+    """Where the problem is not linear in its values and unknowns."""
+    if run.term is not None:
+        raise ValueError(
+            "integral: with an integral term unknowns enter as sources and as values of conditions, linearly; these "
+            "multiply u or enter nonlinearly"
+        )
+    found, good, steps = joint_newton(run, lines, start, u0)
+    unknowns = {n: found.unknowns[k] for k, n in enumerate(lines.names)}
+    recipe = replace(recipe, formulation=run.formulation)
+    return _finished(run, unknowns, found.values, found.taylor, good, steps, recipe, again)
+
+
+def _finished(
+    run: Bordered, unknowns: dict[str, Any], values: Any, taylor: Any, good: Any, steps: int, recipe: Recipe,
+    again: Again,
+) -> WithUnknowns:  # fmt: skip
     """Judge what came out, and hand it on."""
-    disc, names = run.disc, list(start)
-    traced, plain = is_traced(values, unknowns), run.fit(unknowns, values, recipe)
+    cloud, traced = run.disc.cloud, is_traced(values, unknowns)
+    plain = run.fit(unknowns, values, recipe, taylor)
     if not traced:
         values = np.asarray(values)
-        if names:
-            _refuse_nonlinear(run, answer, start, unknowns)
-        run.disc = run.moved(unknowns, values)
-        run.problem = run.disc.problem
-        run.nums, run.values = run.numbers(), values
+        run.go(unknowns, values)
+        run.nums, run.values = run.numbers(taylor), values
         told = run.term and run.term.coarse()
         if told:
             run.object(told)
-        if not bool(good) and not run.failed and np.isfinite(values).all():
-            run.fail(f"the constraints are not met after {steps} step(s) of Newton's method; are they possible?")
         good = bool(good) and not run.failed and bool(np.isfinite(values).all())
     run.seconds["total"] = time.perf_counter() - run.began
     several, stats = isinstance(run, BorderedRegionsRun), run.stats()
     kind: Any = ComparedRegionsFit if several else ComparedFit
     own = kind(*plain.tree_flatten()[0], recipe)
-    own.again = None if traced else again
+    near = None if taylor is None else values
+    own.again = None if traced else lambda order: again(order, unknowns, near)
     return (ConstrainedRegionsSolution if several else ConstrainedSolution)(
-        values, disc.cloud, recipe, own, good, steps, stats, report=None if traced else run, unknowns=unknowns
+        values, cloud, recipe, own, good, steps, stats, report=None if traced else run, unknowns=unknowns
     )
 
 
 def _check(problem: Problem, run: Bordered) -> None:
-    """As many constraints as unknowns, of a problem that is linear in u."""
+    """As many constraints as unknowns."""
     assert problem.extras is not None
     constraints, unknowns = problem.extras.constraints, problem.extras.unknowns
     floating = run.disc.floating
@@ -172,11 +188,6 @@ def _check(problem: Problem, run: Bordered) -> None:
         )
     if problem.extras.kernels and run.disc.scheme.method != "S":
         raise ValueError(f'method: {run.disc.scheme.method} is not made for integral terms; use "S"')
-    if not run.disc.linear:
-        raise ValueError(
-            "constraints: the problem is nonlinear in u, and constraints are made for linear ones; solve it for given "
-            "unknowns and find them outside, e.g. with scipy.optimize.root on the functional"
-        )
     if run.disc.scheme.method in ("I", "II"):
         raise ValueError(f'method: {run.disc.scheme.method} is not made for constraints; use "S", "III" or "SSPH"')
     wanted = len(unknowns) or (0 if problem.extras.kernels else len(floating))
@@ -189,8 +200,8 @@ def _check(problem: Problem, run: Bordered) -> None:
         )
 
 
-def _response(run: Bordered, start: dict[str, Any]) -> Response:
-    """Assemble at the start, and once more for every unknown moved by one."""
+def _response(run: Bordered, start: dict[str, Any]) -> Response | None:
+    """Assemble at the start, and once more for every unknown moved by one; None where one multiplies u."""
     names = list(start)
     parts: list[Any] = []
     nums = run.numbers()
@@ -200,7 +211,8 @@ def _response(run: Bordered, start: dict[str, Any]) -> Response:
     for name in names:
         disc = run.moved({**start, name: start[name] + 1.0})
         there = run.numbers_of(disc)
-        _refuse_in_operator(nums.of_matrix, there.of_matrix, name)
+        if not _same(nums.of_matrix, there.of_matrix):
+            return None
         columns.append(run.right_of(there) - right)
         held.append((there.held - nums.held)[run.disc.partner])
     xp: Any = jnp if is_traced(columns, held) else np
@@ -208,30 +220,24 @@ def _response(run: Bordered, start: dict[str, Any]) -> Response:
     return Response(nums, right, *((xp.stack(columns, 1), xp.stack(held)) if names else empty))
 
 
-def _refuse_in_operator(one: list[Any], two: list[Any], name: str) -> None:
-    for a, b in zip(one, two, strict=True):
-        a, b = concrete(a), concrete(b)
-        if a is not None and b is not None and not np.array_equal(np.asarray(a), np.asarray(b)):
-            raise ValueError(
-                f"unknowns: {name!r} multiplies u or a derivative of it; unknowns enter as sources and as values of "
-                "conditions. For an eigenvalue take js.eigen, or a field of its own with zero slope"
-            )
+def _same(one: list[Any], two: list[Any]) -> bool:
+    """Whether numbers are the same, as far as they are known."""
+    pairs = [(concrete(a), concrete(b)) for a, b in zip(one, two, strict=True)]
+    return all(a is None or b is None or np.array_equal(np.asarray(a), np.asarray(b)) for a, b in pairs)
 
 
-def _refuse_nonlinear(run: Bordered, answer: Response, start: Any, unknowns: Any) -> None:
-    """The unknowns must have entered as they were taken to."""
-    away = np.array([float(unknowns[n] - start[n]) for n in start])
+def _entered_linearly(run: Bordered, answer: Response, start: Any, unknowns: Any) -> Any:
+    """Whether the unknowns entered as they were taken to."""
+    away = jnp.stack([unknowns[n] - start[n] for n in start])
     nums = run.numbers_of(run.moved(unknowns))
     found = (answer.right, answer.columns @ away, run.right_of(nums)), (
-        answer.nums.held, np.tensordot(away, answer.held, axes=1), nums.held
+        answer.nums.held, jnp.tensordot(away, answer.held, axes=1), nums.held
     )  # fmt: skip
+    linearly: Any = True
     for first, moved, there in found:
-        size = max(np.abs(part).max(initial=0.0) for part in (first, moved, there))
-        if np.isfinite(there).all() and np.abs(first + moved - there).max(initial=0.0) > LINEAR * size:
-            raise ValueError(
-                f"unknowns: {', '.join(map(repr, start))} enter the equation or the conditions nonlinearly; only "
-                "linear terms are made for it: take the term itself for the unknown, as q for exp(a)"
-            )
+        size = jnp.stack([jnp.abs(part).max(initial=0.0) for part in (first, moved, there)]).max()
+        linearly &= ~(jnp.abs(first + moved - there).max(initial=0.0) > LINEAR * size)  # NaN are told elsewhere
+    return jax.lax.stop_gradient(linearly)
 
 
 def _solved(run: Bordered, answer: Response) -> tuple[Any, Any]:
@@ -241,27 +247,6 @@ def _solved(run: Bordered, answer: Response) -> tuple[Any, Any]:
     if is_traced(x):
         return x, jnp.isfinite(x).all() & good
     return x, bool(good) and bool(np.isfinite(x).all())
-
-
-def _value(c: Any, probe: Any, k: int) -> Any:
-    try:
-        found = jnp.asarray(c.functional(probe))
-    except IN_FUNCTIONS as error:
-        raise ValueError(
-            f"constraints[{k}]: calling functional(sol) failed: {in_words(error)}; write it with jax.numpy, of what "
-            "sol offers: u, values and derivatives at points, integral, flux, unknowns"
-        ) from error
-    if found.shape or jnp.iscomplexobj(found):
-        raise ValueError(f"constraints[{k}]: functional(sol) must return a real scalar, got shape {found.shape}")
-    return found - c.value
-
-
-def _of_free(disc: Any, by_value: Any) -> Any:
-    """Slopes (K, n) by the unknowns, from those by all values (K, N F): a periodic image adds to its partner's."""
-    number = disc.unknowns.reshape(-1)
-    place = np.flatnonzero(number >= 0)
-    count = int((~disc.held).sum())
-    return jnp.zeros((len(by_value), count)).at[:, number[place]].add(by_value[:, place])
 
 
 def _host(x: Any) -> Any:

@@ -11,8 +11,9 @@ import numpy as np
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.cloud.regions.region_cloud import RegionCloud
 from jsmitsm.equation.unknowns.point_source import Kelvin, Singular, derivative_of
-from jsmitsm.runtime.tracers import concrete
+from jsmitsm.runtime.tracers import concrete, is_traced
 from jsmitsm.solution.evaluation import checked_points, in_domain
+from jsmitsm.solution.flags import NOTHING
 from jsmitsm.solution.regions.located import located
 from jsmitsm.solution.regions.solution import RegionsSolution
 from jsmitsm.solution.solution import Solution
@@ -42,6 +43,11 @@ class PointSolution(Solution):
     @property
     def u(self) -> Any:
         return jnp.asarray(self.regular.u) + jax.vmap(self.singular.at)(jnp.asarray(self.cloud.points))
+
+    @property
+    def flags(self) -> list[str]:
+        """Those of the regular part, unless it is round-off beside the singular one: then that is the solution."""
+        return [] if _negligible(self) else super().flags
 
     @property
     def coefficients(self) -> Any:
@@ -96,6 +102,11 @@ class RegionsPointSolution(RegionsSolution):
         return values
 
     @property
+    def flags(self) -> list[str]:
+        """Those of the regular part, unless it is round-off beside the singular one: then that is the solution."""
+        return [] if _negligible(self) else super().flags
+
+    @property
     def coefficients(self) -> Any:
         raise ValueError(_TAYLOR)
 
@@ -118,6 +129,14 @@ class RegionsPointSolution(RegionsSolution):
     @classmethod
     def tree_unflatten(cls, _, leaves):
         return cls.of(*leaves) if isinstance(leaves[0], Solution) else _placeholder(cls, leaves)
+
+
+def _negligible(sol: Any) -> bool:
+    """Whether the regular part is round-off beside the whole, at the particles."""
+    if is_traced(sol.regular.u, sol.u):
+        return False
+    regular, whole = (np.abs(np.asarray(x, float)) for x in (sol.regular.u, sol.u))
+    return bool(regular.max(initial=0.0) <= NOTHING * whole[np.isfinite(whole)].max(initial=0.0))
 
 
 def _sound(regular: Solution, parts: list[Singular | Kelvin]) -> Any:
