@@ -210,8 +210,7 @@ def _by_misfits(fit: Fit, low: Discretization, values: Any, order: int, own: np.
     error: Any = None
     try:
         error, units, theirs = _towards(fit, low, values, order)
-        size = lambda missed: float(np.sqrt(np.mean(missed**2)))
-        if size(theirs()) <= BETTER * size(own) or companion == fit.recipe.order and not low.rec.depth:
+        if _mean_size(theirs()) <= BETTER * _mean_size(own) or companion == fit.recipe.order and not low.rec.depth:
             return error, units
     except SolveError:
         if companion == fit.recipe.order and not low.rec.depth:
@@ -226,6 +225,11 @@ def _by_misfits(fit: Fit, low: Discretization, values: Any, order: int, own: np.
     if error is None or share(np.asarray(other), np.asarray(values)) < share(np.asarray(error), np.asarray(values)):
         return other, units
     return error, units
+
+
+def _mean_size(missed: np.ndarray) -> float:
+    largest = float(np.abs(missed).max(initial=0.0)) or 1.0  # no square overflows
+    return largest * float(np.sqrt(np.mean((missed / largest) ** 2)))
 
 
 def _towards(

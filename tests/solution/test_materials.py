@@ -374,10 +374,16 @@ def test_constraints_and_unknowns_speak_of_regions_and_interfaces():
         assert abs(sol.region("a")([[0.25]])[0] - 3.0 * (slope / 4 - 1 / 32)) < 1e-11
     assert abs(jax.grad(lambda v: solved(cases[0][0], v).unknowns["q"])(1.0) - 1.0 / inside) < 1e-9 / inside
     assert sol.error_estimate().max() < 1e-11 and pickle.loads(pickle.dumps(sol)).unknowns == sol.unknowns
-    wrong = js.Problem({n: lambda u, x, g: g["q"] * js.laplacian(u)(x) + 1.0 for n in k}, bcs, unknowns={"q": 1.0},
-                       constraints=[js.constraint(cases[0][0], 1.0)])  # fmt: skip
-    with pytest.raises(ValueError, match="multiplies u"):
-        js.solve(wrong, cloud)
+    # q u'' = -1 with one flux k u': u is w / q, w that of q = 1, and q the integral of w where that of u is one.
+    product = js.Problem({n: lambda u, x, g: g["q"] * js.laplacian(u)(x) + 1.0 for n in k}, bcs, unknowns={"q": 1.0},
+                         constraints=[js.constraint(cases[0][0], 1.0)])  # fmt: skip
+    alone = dict(bcs, **{"a|b": js.interface({n: lambda u, x, n_, c=c: c * n_ @ js.grad(u)(x) for n, c in k.items()},
+                                             resistance=0.2)})  # fmt: skip
+    w = js.solve(js.Problem({n: lambda u, x: js.laplacian(u)(x) + 1.0 for n in k}, alone), cloud).integral(region="a")
+    near = js.solve(product.replace(unknowns={"q": 1.3 * float(w)}), cloud)
+    assert abs(near.unknowns["q"] - w) < 1e-9 * w
+    with pytest.raises(js.SolveError, match="did not converge"):
+        js.solve(product, cloud)
     ends = {"boundary": js.neumann(lambda x: 2.0 * x[0] - 1.0), "a|b": js.interface(conduction(k), source=-3.0)}
     free = js.Problem(dict.fromkeys(k, laplace), ends, constraints=[js.constraint(lambda s: s.integral(), 2.0)])
     with pytest.raises(js.SolveError, match="do not balance"):  # the flux that leaves is none of what comes

@@ -106,11 +106,9 @@ class JointRecord(Record):
     def tried(self, here: Any, altered: Any = None) -> Any:
         self.solves += 1
         try:
-            with raising(self.run):
-                made = self.stepping.step(here).numbers()
-        except SolveError:
+            return _stepped(self.run, self.stepping, here)
+        except ValueError:  # far away the user's functions may be out of their range
             return None
-        return made if all(np.isfinite(x).all() for x in made) else None
 
     def distance(self, new: Any, old: Any) -> float:
         return max(distance(new, old), float(np.max(self.weights * np.abs(new.unknowns - old.unknowns), initial=0.0)))
@@ -129,7 +127,7 @@ def joint_newton(run: Bordered, lines: Lines, unknowns: dict[str, Any], u0: Any)
         record = JointRecord(run, shown)
         record.stepping = stepping
         here = here.numbers()
-        target = record.tried(here)
+        target = _stepped(run, stepping, here)
         if target is None:
             run.fail(
                 "values and unknowns: equations and constraints linearised at the start determine no step; start "
@@ -155,6 +153,16 @@ def joint_newton(run: Bordered, lines: Lines, unknowns: dict[str, Any], u0: Any)
         for _ in range(repeats(record.rate)):
             last = stepping.again(last)
     return last, found.good and not run.failed, record.steps
+
+
+def _stepped(run: Bordered, stepping: Stepping, here: Iterate) -> Iterate | None:
+    """One step, None where none is determined."""
+    try:
+        with raising(run):
+            made = stepping.step(here).numbers()
+    except SolveError:
+        return None
+    return made if all(np.isfinite(x).all() for x in made) else None
 
 
 def _first(run: Bordered, u0: Any) -> tuple[Any, Any]:
