@@ -64,7 +64,8 @@ def test_slopes_at_walls_have_the_order_of_the_method(case):
     fields = 2 if exact is TWO else 1
     slopes = jax.vmap(jax.jacfwd(exact))
     errors = []
-    for n in {1: (17, 33), 2: (11, 21), 3: (5, 9)}[dim]:
+    # On 11 x 11 particles a plate's error is half of what its order says of it.
+    for n in {1: (17, 33), 2: (15, 29) if case == "plate" else (11, 21), 3: (5, 9)}[dim]:
         cloud = [
             js.interval(0.0, 1.0, n),
             js.rectangle((0, 0), (1, 1), (n, n), jitter=0.1),
