@@ -34,6 +34,8 @@ _GAP = 10.0
 # Where contributions fall with less than this power of the spacing, solutions of two orders miss the same, and are
 # nearer to each other than to what is true: the distance is taken for that part of the error.
 _SLOW, _ALIKE = 2.0, 0.5
+# The numbers of two rounds may differ by so many times what the first was thought to be off by.
+_AGREE = 3.0
 # Where they part, at a corner most often, that falls with this power of the spacing.
 _PARTED = 0.5
 # While only that is wanting, the error at the particles may go back to so many of the usual aims.
@@ -66,6 +68,7 @@ class Rounds:
         self.solution: Solution = None  # type: ignore[assignment]
         self.error, self.reached = np.inf, False
         self.number: float | None = None
+        self.number_before: float | None = None
         self.flags: list[str] = []
         self.messages: list[str] = []
         self.rows: list[tuple[int, int, float, float, float]] = []
@@ -132,7 +135,8 @@ class Rounds:
         now = time.perf_counter()
         self.rows.append((len(cloud), order, found.error, now - self.clock, float(h.min())))
         self.clock = now
-        self.solution, self.error, self.number = sol, found.error, found.number
+        self.solution, self.error = sol, found.error
+        self.number_before, self.number = self.number, found.number
         return sol, found
 
     def _clocked(self) -> None:
@@ -214,7 +218,7 @@ class Rounds:
                 self.apart = apart
             else:
                 self.error = max(self.error, between)
-        self.error = max(self.error, self._doubted(found, cloud, spacing))
+        self.error = max(self.error, self._doubted(found, cloud, spacing), self._disagreed())
         self.reached = self.error <= self.tol and not self.flags and self.apart is None
         return self.reached
 
@@ -224,6 +228,13 @@ class Rounds:
             return 0.0
         slow = self._marks(found, cloud, spacing).rate < _SLOW
         return float(found.local[slow].max(initial=0.0)) / _ALIKE
+
+    def _disagreed(self) -> float:
+        """By how much the number changed unforeseen: what makes it of the values, a quadrature say, errs too."""
+        if self.number is None or self.number_before is None:
+            return 0.0
+        change = abs(self.number - self.number_before) / (abs(self.number) or 1.0)
+        return change - _AGREE * self.rows[-2][2]
 
     def _checked(self, sol: Solution, found: Measured, cloud: Cloud, spacing: SpacingField) -> None:
         """Where the solution of another order is farther away than the tolerance, that is the error.
