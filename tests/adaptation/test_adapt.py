@@ -263,7 +263,7 @@ def test_where_smoothness_ends_the_estimate_is_half_of_the_error():
     x = np.asarray(cloud.points)
     rough = x[:, 0] < 0.2
     field = SpacingField(x, np.full(101, 0.01), 0.01)
-    local = np.where(x[:, 0] < 0.3, 2e-4, 3e-4)  # contributions are the largest of some neighbours'
+    local = np.where(x[:, 0] < 0.3, 2e-4, 3e-4)  # contributions are the largest of some neighbours
     found = Measured(3e-4, np.where(rough, 1 / 1.5, 2.0**-5), 1.0, local=local)
     assert search._doubted(found, cloud, field) == 0.0  # nobody knows a rate yet
     none = np.zeros(101, bool)
