@@ -24,7 +24,8 @@ class Measured:
     """error: relative, in the measure of the tolerance; infinite where there is none. contribution (N,): of every
     particle to it, in a scale of their own. scale: the largest |u|. apart: the distance to the solution of another
     order, infinite where that is not known to the last. number: of the quantity, if there is one. gathered: the error
-    that contributions (N,) of random signs make, in the scale of theirs; None where that is not known."""
+    that contributions (N,) of random signs make, in the scale of theirs; None where that is not known. local (N,): the
+    estimate at every particle, relative to the largest |u|; None where the tolerance is on something else."""
 
     error: float
     contribution: np.ndarray
@@ -32,6 +33,7 @@ class Measured:
     apart: float = np.inf
     number: float | None = None
     gathered: Callable[[np.ndarray], float] | None = None
+    local: np.ndarray | None = None
 
 
 def measured(sol: Solution, spacing: np.ndarray, order: int, norm: str, quantity: Quantity | None) -> Measured:
@@ -59,7 +61,9 @@ def measured(sol: Solution, spacing: np.ndarray, order: int, norm: str, quantity
         # A step of Newton's method leads to another order but about.
         exact = sol.iterations == 1 and sol.defects
         apart = of(found.towards) if exact else np.inf
-        return Measured(relative, contribution, scale, apart, gathered=_gathering(found, far, defect.shape, norm))
+        local = np.abs(error).max(axis=1) / scale if norm == "max" and scale > 0 else None
+        gathered = _gathering(found, far, defect.shape, norm)
+        return Measured(relative, contribution, scale, apart, gathered=gathered, local=local)
     number, weights = _weights(sol, quantity)
     if weights is None:  # nothing differentiable: the whole solution stands for the number
         return Measured(relative, contribution, scale, number=number)

@@ -29,8 +29,13 @@ _LADDER = {
 }
 # A rough solution that a round leaves with this part of its error gets no better by particles.
 _HOPE = 0.5
-# Polynomials of neighbours may differ between them by so many tolerances.
+# Polynomials of neighbours may differ between them by so many tolerances: they are off by so much more than the values.
 _GAP = 10.0
+# Where contributions fall with less than this power of the spacing, solutions of two orders miss the same, and are
+# nearer to each other than to what is true: the distance is taken for that part of the error.
+_SLOW, _ALIKE = 2.0, 0.5
+# The numbers of two rounds may differ by so many times what the first was thought to be off by.
+_AGREE = 3.0
 # Where they part, at a corner most often, that falls with this power of the spacing.
 _PARTED = 0.5
 # While only that is wanting, the error at the particles may go back to so many of the usual aims.
@@ -63,6 +68,7 @@ class Rounds:
         self.solution: Solution = None  # type: ignore[assignment]
         self.error, self.reached = np.inf, False
         self.number: float | None = None
+        self.number_before: float | None = None
         self.flags: list[str] = []
         self.messages: list[str] = []
         self.rows: list[tuple[int, int, float, float, float]] = []
@@ -129,7 +135,8 @@ class Rounds:
         now = time.perf_counter()
         self.rows.append((len(cloud), order, found.error, now - self.clock, float(h.min())))
         self.clock = now
-        self.solution, self.error, self.number = sol, found.error, found.number
+        self.solution, self.error = sol, found.error
+        self.number_before, self.number = self.number, found.number
         return sol, found
 
     def _clocked(self) -> None:
@@ -205,10 +212,29 @@ class Rounds:
         self.flags = sol.flags
         apart = gaps(sol) if self.quantity is None and self.norm == "max" and sol.defects else None
         self.apart = None
-        if apart is not None and apart.max() > _GAP * self.tol * found.scale:
-            self.apart = apart
+        if apart is not None and found.scale > 0:
+            between = float(apart.max()) / found.scale / _GAP
+            if between > self.tol:
+                self.apart = apart
+            else:
+                self.error = max(self.error, between)
+        self.error = max(self.error, self._doubted(found, cloud, spacing), self._disagreed())
         self.reached = self.error <= self.tol and not self.flags and self.apart is None
         return self.reached
+
+    def _doubted(self, found: Measured, cloud: Cloud, spacing: SpacingField) -> float:
+        """The error where smoothness ends, of which the estimate sees a part."""
+        if found.local is None or self.before is None:
+            return 0.0
+        slow = self._marks(found, cloud, spacing).rate < _SLOW
+        return float(found.local[slow].max(initial=0.0)) / _ALIKE
+
+    def _disagreed(self) -> float:
+        """By how much the number changed unforeseen: what makes it of the values, a quadrature say, errs too."""
+        if self.number is None or self.number_before is None:
+            return 0.0
+        change = abs(self.number - self.number_before) / (abs(self.number) or 1.0)
+        return change - _AGREE * self.rows[-2][2]
 
     def _checked(self, sol: Solution, found: Measured, cloud: Cloud, spacing: SpacingField) -> None:
         """Where the solution of another order is farther away than the tolerance, that is the error.
@@ -247,11 +273,9 @@ class Rounds:
 
     def _next(self, found: Measured, cloud: Cloud, spacing: SpacingField) -> tuple[SpacingField, Cloud] | None:
         points, h = np.asarray(cloud.points), spacing(np.asarray(cloud.points))
-        power = self.solution.order + 1.0 + min(0, cloud.dim - self._operator_order(self.solution))
-        trusted = len(self.rows) > 1 and np.isfinite(found.error)
-        contribution, error = found.contribution, self.error if np.isfinite(self.error) else 1e3
+        power, error = self._power(cloud), self.error if np.isfinite(self.error) else 1e3
         apart, self.apart = self.apart, None
-        here = marks(points, h, contribution, power, self.before if trusted else None)
+        here = self._marks(found, cloud, spacing)
         self.before = here if np.isfinite(found.error) else None
         if len(cloud) >= _FULL * self.max_particles:
             self._limit(f"the {self.max_particles} particles that were allowed (max_particles)")
@@ -287,6 +311,15 @@ class Rounds:
             self._limit("the cloud's maker, which refused finer ones")
             return None
         return field, following
+
+    def _power(self, cloud: Cloud) -> float:
+        """The power of the spacing by which contributions to the error of a smooth solution fall."""
+        return self.solution.order + 1.0 + min(0, cloud.dim - self._operator_order(self.solution))
+
+    def _marks(self, found: Measured, cloud: Cloud, spacing: SpacingField) -> Marks:
+        trusted = len(self.rows) > 1 and np.isfinite(found.error)
+        points, before = np.asarray(cloud.points), self.before if trusted else None
+        return marks(points, spacing(points), found.contribution, self._power(cloud), before)
 
     def _better(self, spacing: SpacingField) -> SpacingField | None:
         """The spacing of a round before that did better than the last one, over which no other may grow then."""

@@ -10,6 +10,8 @@ from jsmitsm.adaptation.data import data_of, unresolved
 from jsmitsm.adaptation.first_cloud import first_cloud
 from jsmitsm.adaptation.layers import layers
 from jsmitsm.adaptation.marking import Marks, marks, next_spacing
+from jsmitsm.adaptation.measure import Measured
+from jsmitsm.adaptation.rounds import Rounds
 from jsmitsm.adaptation.spacing_field import GROWTH, SpacingField
 
 CORNER = [(0, 0), (1, 0), (1, 1), (-1, 1), (-1, -1), (0, -1)]
@@ -236,6 +238,38 @@ def test_rounds_do_not_undo_each_other():
     found = js.adapt(problem, lambda spacing: js.from_polygon(SQUARE, spacing), 1e-2)
     error = np.abs(found.solution.u - jax.vmap(exact)(found.cloud.points)).max()
     assert found.reached and error < 1e-2 and len(found.history["particles"]) <= 4
+
+
+def a_search(tol=1e-3):
+    return Rounds(GOOD, line, tol, "auto", None, "max", 1000, 9, {}, 0.0)
+
+
+def test_numbers_that_move_more_than_was_thought_are_not_believed():
+    """A change of 0.03 after an error of 0.001 was estimated: all but three times that was foreseen by nobody."""
+    search = a_search()
+    search.rows = [(10, 4, 1e-3, 0.0, 0.1), (20, 4, 1e-9, 0.0, 0.1)]
+    search.number = 1.0
+    assert search._disagreed() == 0.0
+    search.number_before = 1.03
+    assert search._disagreed() == pytest.approx(0.027)
+    search.number_before = 1.002
+    assert search._disagreed() <= 0.0
+
+
+def test_where_smoothness_ends_the_estimate_is_half_of_the_error():
+    """Contributions that fell by 1.5 where the spacing was halved, at a place; by 2^5 elsewhere."""
+    search, cloud = a_search(), js.interval(0.0, 1.0, 101)
+    search.solution = js.solve(GOOD, cloud, order=4)
+    x = np.asarray(cloud.points)
+    rough = x[:, 0] < 0.2
+    field = SpacingField(x, np.full(101, 0.01), 0.01)
+    local = np.where(x[:, 0] < 0.3, 2e-4, 3e-4)  # contributions are the largest of some neighbours
+    found = Measured(3e-4, np.where(rough, 1 / 1.5, 2.0**-5), 1.0, local=local)
+    assert search._doubted(found, cloud, field) == 0.0  # nobody knows a rate yet
+    none = np.zeros(101, bool)
+    search.rows = [(101, 4, 1e-2, 0.0, 0.02), (101, 4, 3e-4, 0.0, 0.01)]
+    search.before = Marks(x, np.full(101, 0.02), np.ones(101), np.full(101, 5.0), none, none)
+    assert search._doubted(found, cloud, field) == pytest.approx(4e-4)
 
 
 # ------------------------------------------------------------------ bad input
