@@ -106,7 +106,7 @@ class JointRecord(Record):
     def tried(self, here: Any, altered: Any = None) -> Any:
         self.solves += 1
         try:
-            return _stepped(self.run, self.stepping, here)
+            return _stepped(self.stepping, here)
         except ValueError:  # far away the user's functions may be out of their range
             return None
 
@@ -127,7 +127,7 @@ def joint_newton(run: Bordered, lines: Lines, unknowns: dict[str, Any], u0: Any)
         record = JointRecord(run, shown)
         record.stepping = stepping
         here = here.numbers()
-        target = _stepped(run, stepping, here)
+        target = _stepped(stepping, here)
         if target is None:
             run.fail(
                 "values and unknowns: equations and constraints linearised at the start determine no step; start "
@@ -155,10 +155,10 @@ def joint_newton(run: Bordered, lines: Lines, unknowns: dict[str, Any], u0: Any)
     return last, found.good and not run.failed, record.steps
 
 
-def _stepped(run: Bordered, stepping: Stepping, here: Iterate) -> Iterate | None:
+def _stepped(stepping: Stepping, here: Iterate) -> Iterate | None:
     """One step, None where none is determined."""
     try:
-        with raising(run):
+        with raising(stepping.run):
             made = stepping.step(here).numbers()
     except SolveError:
         return None
