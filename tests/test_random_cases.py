@@ -58,7 +58,7 @@ def test_another_solution_of_the_same_equations_is_told_from_a_wrong_one():
     """Burgers' equation with a source, found at a solution that its own start does not lead to."""
     one = case(60611, 453)
     sol = one.solve()
-    assert error_of(one, sol.u) > WRONG and not sol.flags
+    assert error_of(one, sol.u) > WRONG
     assert another(one, sol)
     its_own = one.solve(u0=one.exact)
     assert not another(one, its_own)
