@@ -127,10 +127,7 @@ def _searched(record: Record, begin: Iterate, first: Iterate) -> Found:
         if best.good:
             break
         ways.append(name)
-        near = search(record, begin, first)
-        step = None if near is None else record.tried(near)
-        if near is not None and step is not None:
-            best = min(best, damped(record, near, step), key=lambda found: (not found.good, found.change))
+        best = from_nearer(record, best, search(record, begin, first))
     if not best.good:
         refuse_jumps_at(record.run, best.at.values, best.at.taylor)
         record.run.fail(
@@ -138,15 +135,28 @@ def _searched(record: Record, begin: Iterate, first: Iterate) -> Found:
             f"next one would still change u by {best.change:.1e} of its size; start nearer (u0), approach the "
             "parameters in stages (js.continuation), or refine the cloud"
         )
-    elif record.run.disc.floating:
-        record.run.check_balance(best.at.taylor)
-        best = best._replace(good=not record.run.failed)
-    if len(best.frozen):
-        record.run.object(
-            f"The expansions of {len(best.frozen)} particle(s), first {some(best.frozen)}, do not settle: the solution "
-            "is sharper there than the cloud resolves; refine it."
+    return judged(record.run, best)
+
+
+def from_nearer(record: Record, best: Found, near: Iterate | None) -> Found:
+    """The best so far, or what damped steps find from another start."""
+    step = None if near is None else record.tried(near)
+    if near is None or step is None:
+        return best
+    return min(best, damped(record, near, step), key=lambda found: (not found.good, found.change))
+
+
+def judged(run: Run, found: Found) -> Found:
+    """Data of a field that floats must balance at a solution; particles that do not settle are told."""
+    if found.good and run.floating:
+        run.check_balance(found.at.taylor)
+        found = found._replace(good=not run.failed)
+    if len(found.frozen):
+        run.object(
+            f"The expansions of {len(found.frozen)} particle(s), first {some(found.frozen)}, do not settle: the "
+            "solution is sharper there than the cloud resolves; refine it."
         )
-    return best
+    return found
 
 
 def _without_depth(record: Record, begin: Iterate) -> Found | None:

@@ -22,7 +22,7 @@ from jsmitsm.runtime.errors import SolveError
 from jsmitsm.runtime.progress import bar
 from jsmitsm.runtime.tracers import concrete, is_traced
 from jsmitsm.solution.nonlinear.damped import damped
-from jsmitsm.solution.nonlinear.newton import newton, repeats, wandering
+from jsmitsm.solution.nonlinear.newton import from_nearer, judged, newton, repeats, wandering
 from jsmitsm.solution.nonlinear.start import start
 from jsmitsm.solution.nonlinear.steps import Iterate, Record, distance, raising
 from jsmitsm.solution.unknowns.bordered import Bordered
@@ -137,21 +137,21 @@ def joint_newton(run: Bordered, lines: Lines, unknowns: dict[str, Any], u0: Any)
             return nothing, False, 1
         record.weights = target.size / np.maximum(np.maximum(np.abs(target.unknowns), np.abs(begin)), 1e-300)
         found = damped(record, here, target)
-        near = None if found.good else wandering(record, here, target)
-        step = None if near is None else record.tried(near)
-        if near is not None and step is not None:
-            found = min(found, damped(record, near, step), key=lambda one: (not one.good, one.change))
+        if not found.good:
+            found = from_nearer(record, found, wandering(record, here, target))
     run.changes = record.changes
-    if not found.good:
-        run.fail(
-            "Newton's method for values and unknowns did not converge: the next step would still change them by "
-            f"{found.change:.1e} of their size; start nearer (u0, and the unknowns' own numbers), or refine the cloud"
-        )
     # At the last iterate once more, with derivatives where something is differentiated.
     last: Any = stepping.step(found.at)
     if is_traced(last):
         for _ in range(repeats(record.rate)):
             last = stepping.again(last)
+    else:
+        found = judged(run, found._replace(at=last))
+    if not found.good and not run.failed:
+        run.fail(
+            "Newton's method for values and unknowns did not converge: the next step would still change them by "
+            f"{found.change:.1e} of their size; start nearer (u0, and the unknowns' own numbers), or refine the cloud"
+        )
     return last, found.good and not run.failed, record.steps
 
 
