@@ -24,6 +24,10 @@ HISTORY = 2**29
 BLOWN = 1e30
 # An estimated error, in time or in all, above this part of the solution is a flag.
 LARGE = 0.02
+# Of the schemes, as ``stats`` tells them.
+NAMES = {
+    "esdirk": "KenCarp4", "imex": "KenCarp4, implicit and explicit", "radau": "Radau IIA 5", "euler": "backward Euler",
+}  # fmt: skip
 
 
 class History:
@@ -239,8 +243,6 @@ def _finished(run: Run, parts: np.ndarray, history: History, fault: str, began: 
 
 
 def _statistics(run: Run, began: float, in_time: float | None) -> dict[str, Any]:
-    names = {"esdirk": "KenCarp4", "imex": "KenCarp4, implicit and explicit", "radau": "Radau IIA 5",
-             "euler": "backward Euler"}  # fmt: skip
     end = time.perf_counter()
     counts = run.counts
     made = run.semi.system.factorisations + (run.newton.counts["factorisations"] if run.newton else 0)
@@ -248,7 +250,7 @@ def _statistics(run: Run, began: float, in_time: float | None) -> dict[str, Any]
     if run.semi.timed.steady:
         skipped.append("data that do not change in time were looked at once")
     return {
-        "scheme": names[run.name],
+        "scheme": NAMES[run.name],
         "steps": counts["steps"],
         "rejected": counts["rejected"],
         "factorisations": made,

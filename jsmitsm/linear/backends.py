@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import importlib.util
 import sys
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from copy import copy
 from functools import cache
@@ -108,7 +109,7 @@ class Pardiso:
             self.solver.free_memory(everything=True)
 
 
-class Krylov:
+class Krylov(ABC):
     """BiCGSTAB; a subclass gives the preconditioner and its transpose."""
 
     most = 100
@@ -121,9 +122,9 @@ class Krylov:
         self.preconditioners: dict[bool, Callable[[np.ndarray], np.ndarray]] = {}
         self.iterations, self.stalled = 0, False
 
+    @abstractmethod
     def preconditioner(self, transpose: bool) -> Callable[[np.ndarray], np.ndarray]:
         """Map that approximates the inverse, or its transpose."""
-        raise NotImplementedError
 
     def apply(self, b: np.ndarray, transpose: bool, tolerance: float = 1e-10) -> np.ndarray:
         """Solve, (n, m) to (n, m), column by column."""

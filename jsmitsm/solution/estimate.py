@@ -102,8 +102,13 @@ def correction(fit: Fit, values: Any, made: Run | None = None) -> Correction:
     have no error; where p + 2 is no better than p (no smoothness, or round-off) the estimate says little.
     """
     low = fit.discretization()
+
+    @cache
+    def nums() -> Numbers:
+        return numbers(low, fit.problem, fit.taylor) if made is None or made.nums is None else made.nums
+
     if fit.recipe.formulation == "lsq" or fit.recipe.method != "S":
-        return _against(fit, low, values)
+        return _against(fit, low, values, nums)
     order = _beside(fit, low)
     high, high_nums = _of_order(fit, low, order)
     above = Run(high, fit.problem, "auto", True, True, "loo")
@@ -113,10 +118,6 @@ def correction(fit: Fit, values: Any, made: Run | None = None) -> Correction:
     trust = _trust(high, *high_rows)
     free = np.flatnonzero(~low.held.reshape(-1))
     run = Run(low, fit.problem, "auto", True, False, "loo")
-
-    @cache
-    def nums() -> Numbers:
-        return numbers(low, fit.problem, fit.taylor) if made is None or made.nums is None else made.nums
 
     @cache
     def own() -> tuple[list[Class], list[Row]]:
@@ -183,15 +184,14 @@ def _trust(disc: Discretization, classes: list[Class], rows: list[Row]) -> Any:
     return _put(trust, ids, part)[:, None]
 
 
-def _against(fit: Fit, low: Discretization, values: Any) -> Correction:
-    """What leads to the solution by method S of order p + 2."""
+def _against(fit: Fit, low: Discretization, values: Any, nums: Callable[[], Numbers]) -> Correction:
+    """What leads to the solution by method S of order p + 2; nums: makes the numbers of the solution's own order."""
     order = _beside(fit, low)
     if fit.recipe.formulation != "lsq" or is_traced(values, low.cloud.points, fit.problem.params):
         error, units, _ = _towards(fit, low, values, order)
         return Correction(error, error, None, None, units)
-    nums = numbers(low, fit.problem, fit.taylor)
-    own = cache(lambda: np.asarray(misfit(low, nums, values)))
-    missed = lambda: _put(np.zeros(low.held.shape), nums.ids, own()[:, None])
+    own = cache(lambda: np.asarray(misfit(low, nums(), values)))
+    missed = lambda: _put(np.zeros(low.held.shape), nums().ids, own()[:, None])
     if order < fit.recipe.order:
         error, units, _ = _towards(fit, low, values, order)
     else:

@@ -288,6 +288,11 @@ class Run:
         return self.disc.floating
 
     @property
+    def least_squares(self) -> bool:
+        """Whether equations of the global system come from the least-squares form."""
+        return self.formulation == "lsq"
+
+    @property
     def bordering(self) -> int:
         """How many rows and columns the global system has besides those of the particles' values."""
         return len(self.floating)

@@ -155,6 +155,9 @@ def test_a_free_constant_of_a_nonlinear_problem():
     pde = lambda u, x: js.laplacian(u)(x) + js.grad(u)(x)[0] ** 2 - 1 - x[0] ** 2
     sol = js.solve(js.Problem(pde, ends, constraints=[js.constraint(lambda s: s.integral(), 2.0)]), ROD)
     assert abs(sol.u - (ROD.points[:, 0] ** 2 / 2 + 2 - 1 / 6)).max() < 1e-10 and not sol.flags
+    more = lambda u, x: pde(u, x) - 1.0
+    with pytest.raises(js.SolveError, match="do not balance"):
+        js.solve(js.Problem(more, ends, constraints=[js.constraint(lambda s: s.integral(), 2.0)]), ROD)
 
 
 def test_a_nonlinear_conductivity_beside_another_material():

@@ -10,7 +10,7 @@ import numpy as np
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.equation.problem import Problem
 from jsmitsm.evolution.arguments import check, saved_times
-from jsmitsm.evolution.march import LARGE, marched
+from jsmitsm.evolution.march import LARGE, NAMES, marched
 from jsmitsm.parallel.distributed import ParallelCloud, bisected, slab_of
 from jsmitsm.parallel.local import OfOwn, Settings
 from jsmitsm.parallel.pencil.run import ParallelRun, TimedLocal
@@ -19,10 +19,10 @@ from jsmitsm.parallel.solving import refuse_others
 from jsmitsm.parallel.team import team
 from jsmitsm.runtime.arrays import ValueOrFunction
 from jsmitsm.runtime.errors import SolveError, did_you_mean, explained, explaining
+from jsmitsm.runtime.progress import bar
 
 # Schemes that are made for several processes.
 SCHEMES = ("auto", "esdirk", "imex", "euler")
-_NAMES = {"esdirk": "KenCarp4", "imex": "KenCarp4, implicit and explicit", "euler": "backward Euler"}
 
 
 class ParallelEvolution(OfOwn):
@@ -53,12 +53,6 @@ class ParallelEvolution(OfOwn):
 
     def __repr__(self) -> str:
         return f"ParallelEvolution({len(self.t)} times, {self.u.shape[1]} of {self._local.mine.count} particles here)"
-
-
-class _Silent:
-    """No bar."""
-
-    def update(self, done: int = 1) -> None: ...
 
 
 @explaining
@@ -123,8 +117,9 @@ def evolve(
     local = TimedLocal(us, problem, bisected(us, slab), settings, t0)
     run = ParallelRun(local, u0, (t0, t1), began, scheme, damping, solver)
     made = time.perf_counter()
-    history, fault = marched(run, None if steps is None else int(steps), None if tol is None else float(tol), parts,
-                             _Silent())  # fmt: skip
+    count, wanted = None if steps is None else int(steps), None if tol is None else float(tol)
+    with bar("steps in time", wanted=False) as shown:
+        history, fault = marched(run, count, wanted, parts, shown)
     if fault:
         raise SolveError(f"the run stopped: {fault}")
     times = np.where(parts >= 1.0, t1, t0 + parts * (t1 - t0))
@@ -137,7 +132,7 @@ def evolve(
     assert isinstance(system, OwnSystem)
     stats = {
         "particles": local.mine.count, "own": len(local.halo.ids), "unknowns": local.size, "processes": us.size,
-        "reach": local.halo.reach, "scheme": _NAMES[run.name], "steps": run.counts["steps"],
+        "reach": local.halo.reach, "scheme": NAMES[run.name], "steps": run.counts["steps"],
         "rejected": run.counts["rejected"], "pencils": run.counts["pencils"],
         "iterations": run.newton.counts["iterations"] if run.newton else 0, "damping": run.damping,
         "error_in_time": later, "linear": system.info,

@@ -208,6 +208,10 @@ class RegionsRun(Run):
         cleared = share <= flags.CLEARED
         return [*certain, *([] if cleared else doubts), *told, *self.against]
 
+    @property
+    def least_squares(self) -> bool:
+        return bool(self.squared)
+
     def _forms(self) -> Any:
         """The form of the global system; where regions differ, that of each."""
         forms = {p.name: "lsq" if p.name in self.squared else "loo" for p in self.disc.parts}

@@ -65,7 +65,7 @@ class Bordered(Run, ABC):
         data, r, c, b = super().assembled(nums, parts)
         if self.term is None:
             return data, r, c, b
-        if self.formulation == "lsq" or getattr(self.disc, "squared", False):
+        if self.least_squares:
             raise ValueError(
                 "integral: the equation takes the least-squares form, for which integral terms are not made; say "
                 'formulation="loo" where information does not travel'
