@@ -174,6 +174,7 @@ def test_the_rest_of_a_whole_call_is_told_by_its_parts(monkeypatch):
         with progress.bar("neighbours"):
             assert "[01:00<?]" in seen()
         with progress.bar("local fits", 4) as stage:
+            stage.start -= 60.0
             stage.update(2)
             assert "solve, local fits 50% [01:00<03:00] 25%" in seen()
         with progress.bar("cholmod on 9 unknowns"):
