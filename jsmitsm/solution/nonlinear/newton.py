@@ -10,6 +10,7 @@ which the next fit is sought. It falls with the misfit (a driven cavity at order
 from __future__ import annotations
 
 import math
+from copy import copy
 from typing import Any
 
 import jax
@@ -18,6 +19,7 @@ import numpy as np
 
 from jsmitsm.discretization.coefficients import slot_series
 from jsmitsm.discretization.layout import discretize, refuse_jumps
+from jsmitsm.discretization.regions.layout import Regions, discretize_regions
 from jsmitsm.equation.branches import FIELD
 from jsmitsm.runtime.errors import SolveError, some
 from jsmitsm.runtime.progress import bar
@@ -164,14 +166,10 @@ def _without_depth(record: Record, begin: Iterate) -> Found | None:
 
     Where they mislead next to it too, as at the corner of a moving lid, it is the solution, and the run without depth.
     """
-    run, disc = record.run, record.run.disc
-    given = disc.stencils if disc.given_stencils else None
-    low = discretize(
-        run.problem, disc.cloud, disc.scheme.method, disc.rec.order, disc.kernel, given, disc.basis_terms,
-        sources=False, depth=0,
-    )  # fmt: skip
-    other = Record(Run(low, run.problem, run.solver, True, run.repair, run.formulation), record.shown)
-    here = begin._replace(taylor=begin.taylor[:, :, : low.rec.size])
+    run = record.run
+    other = Record(shallow(run), record.shown)
+    size = other.run.disc.rec.size
+    here = begin._replace(taylor=begin.taylor[:, :, :size])
     try:
         found = _searched(other, here, advance(other.run, here.taylor).numbers())
     except SolveError:
@@ -179,7 +177,7 @@ def _without_depth(record: Record, begin: Iterate) -> Found | None:
     finally:
         record.steps, record.solves = record.steps + other.steps, record.solves + other.solves
     record.changes += other.changes
-    more = disc.rec.size - low.rec.size
+    more = run.disc.rec.size - size
     near = found.at._replace(taylor=np.pad(found.at.taylor, ((0, 0), (0, 0), (0, more))))
     step = record.tried(near)
     deep = None if step is None else damped(record, near, step)
@@ -189,6 +187,23 @@ def _without_depth(record: Record, begin: Iterate) -> Found | None:
     run.messages.append("With a recursion deeper than the order Newton's steps do not settle; this is without depth.")
     record.rate = other.rate
     return found
+
+
+def shallow(run: Any) -> Any:
+    """A run of the same problem whose recursion ends with the fit, which raises where it fails."""
+    disc, other = run.disc, copy(run)
+    given = disc.stencils if disc.given_stencils else None
+    if isinstance(disc, Regions):
+        near = given and given.indices
+        other.disc = discretize_regions(run.problem, disc.cloud, disc.rec.order, 0, near, sources=False)
+    else:
+        other.disc = discretize(
+            run.problem, disc.cloud, disc.scheme.method, disc.rec.order, disc.kernel, given, disc.basis_terms,
+            sources=False, depth=0,
+        )  # fmt: skip
+    other.throw, other.health, other.linear, other.changes = True, None, {}, []
+    other.messages, other.against, other.seconds = [], [], dict.fromkeys(run.seconds, 0.0)
+    return other
 
 
 def _in_pseudo_time(record: Record, begin: Iterate, first: Iterate) -> Iterate | None:
