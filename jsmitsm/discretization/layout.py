@@ -13,9 +13,10 @@ from jsmitsm.cloud.cloud import Cloud, kept
 from jsmitsm.cloud.neighbours import Stencils
 from jsmitsm.cloud.regions.region_cloud import RegionCloud
 from jsmitsm.cloud.walls import Walls, seen
+from jsmitsm.discretization.parts.whole import Part
 from jsmitsm.discretization.periodic import Images, periodic_images, with_corners
 from jsmitsm.discretization.resolution.digits import room, suited_depth, warn_of_float32
-from jsmitsm.discretization.supports import Part, check_supports, cut_off, default_kernel, find_stencils, walls_of
+from jsmitsm.discretization.supports import check_supports, cut_off, default_kernel, find_stencils, walls_of
 from jsmitsm.equation.branches import FIELD
 from jsmitsm.equation.closing import closed
 from jsmitsm.equation.conditions import Group, group_conditions
@@ -32,8 +33,7 @@ from jsmitsm.runtime.compiled import at_hand
 from jsmitsm.runtime.errors import IN_FUNCTIONS, in_words
 from jsmitsm.runtime.tracers import concrete, is_traced, owned
 
-# Bytes of the user's stencils that are quickly compared.
-_LARGE = 1 << 22
+_LARGE = 1 << 22  # bytes of the user's stencils that are quickly compared
 
 
 @dataclass

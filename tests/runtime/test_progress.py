@@ -45,7 +45,7 @@ def told(seen):
 
 def tuned(**options):
     start = js.SuperGaussian(h=2 * LINE.spacing, d=4.0)
-    return js.tune(LINEAR, LINE, start, order=3, steps=2, **options)
+    return js.tune(LINEAR, LINE, start, order=2, steps=2, **options)
 
 
 def test_every_long_phase_is_a_stage_of_one_bar(monkeypatch):

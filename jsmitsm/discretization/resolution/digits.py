@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from jsmitsm.cloud.cloud import Cloud, kept
-from jsmitsm.discretization.supports import Part
+from jsmitsm.discretization.parts.whole import Part
 from jsmitsm.equation.traced import Traced
 from jsmitsm.particle.recursion import Recursion
 from jsmitsm.runtime.tracers import concrete, is_traced
