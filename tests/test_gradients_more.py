@@ -21,7 +21,7 @@ def line():
 
 def solved(case, t, problem, method, form="auto", order=3):
     return js.solve(
-        problem(t), case.moved(t), method=method, order=2 if method in ("I", "II") else order, formulation=form,
+        problem(t), case.moved(t), method=method, order=2 if method in ("I", "II", "III") else order, formulation=form,
         kernel=js.SuperGaussian(h=t["h"], d=t["d"]), stencils=case.stencils, depth=0,
     )  # fmt: skip
 
