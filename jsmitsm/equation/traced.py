@@ -162,12 +162,22 @@ class Traced:
         consts = r.consts[len(r.consts) - len(r.written.constvars) :]
         return open_fields(r.written, consts, [x, *jax.tree.leaves(params)], asked)[0]
 
-    @cached_property
+    @property
     def kinked_source(self) -> bool:
         """Whether the source may have kinks or jumps, where its Taylor series end, and the coefficients have none."""
+        return self._kinks == (True, False)
+
+    @property
+    def kinked(self) -> bool:
+        """Whether the source or a coefficient may have kinks or jumps."""
+        return any(self._kinks)
+
+    @cached_property
+    def _kinks(self) -> tuple[bool, bool]:
+        """Whether the source may have kinks or jumps, and whether the coefficients may."""
         needed = lambda jac: levels(self._record.jaxpr, self._wanted(jac, not jac))  # noqa: E731
         source, operator = (any(_kinked(eqn) for eqn, _ in needed(jac)) for jac in (False, True))
-        return source and not operator
+        return source, operator
 
     def with_any_numbers(self) -> Traced:
         """The same with some numbers for the constants that are only traced."""

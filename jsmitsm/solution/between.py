@@ -1,7 +1,7 @@
 """What the particles do not see of a problem, and what it would make of the solution.
 
 Between them the residual that the local polynomials leave, where nothing made it small, and boundary data; beyond a
-periodic seam the equation on its other side.
+kink or a jump what the series of one side leave out, beyond a periodic seam the equation on its other side.
 """
 
 from __future__ import annotations
@@ -18,9 +18,10 @@ from jsmitsm.discretization.layout import Class, Discretization
 from jsmitsm.discretization.least_squares import least_squares
 from jsmitsm.discretization.leave_one_out import right_side
 from jsmitsm.discretization.periodic import with_corners
-from jsmitsm.discretization.resolution.residuals import residual
+from jsmitsm.discretization.resolution.residuals import evaluated, residual
 from jsmitsm.discretization.rows import all_coefficients, all_rows
 from jsmitsm.equation.problem import Problem
+from jsmitsm.taylor.multi_indices import multi_indices
 
 # A particle of the same group so many times as far as the nearest ones of all, or whose normal has less than this part
 # of the direction, is not beside.
@@ -28,6 +29,9 @@ NEAR, ASIDE = 1.5, 0.5
 # A coefficient or a source halfway is even where it differs from the mean of both ends by less than this part of them,
 # or of so small a part of the largest anywhere: ten particles a wavelength leave 0.05.
 UNEVEN, SMALL = 0.2, 0.01
+# A series ends at a kink where it misses what is halfway to a neighbour by so many times its last two degrees there,
+# and by more than this part of what is there.
+ENDED, FAINT = 3.0, 1e-6
 
 
 def between(run: Any, values: Any) -> np.ndarray:
@@ -36,6 +40,52 @@ def between(run: Any, values: Any) -> np.ndarray:
     if disc.linear and disc.traced.constant and disc.traced.source != "variable":
         return np.zeros(disc.held.shape)
     return _made_of(run, unresolved(disc, run.nums, run.problem, values))
+
+
+def beyond_kinks(run: Any, values: Any) -> np.ndarray | None:
+    """What the series of a source or a coefficient leave out beyond its kinks and jumps makes of the solution, (N, F).
+
+    Rows of all orders know both by their series at the particles alone, and miss the same. None where there are no
+    kinks, or where the problem is nonlinear.
+    """
+    disc, nums = run.disc, run.nums
+    if nums is None or not disc.linear or not disc.traced.kinked or disc.rec.degree < 2 or run.factor is None:
+        return None
+    fitted = np.asarray(all_coefficients(disc, nums, values), float)
+    points, place = np.asarray(disc.points, float), np.full(len(disc.cloud), -1)
+    place[nums.ids] = np.arange(len(nums.ids))
+    missed = np.zeros((disc.rec.n_rows, len(nums.ids)))
+    for cls in disc.classes:
+        at = place[cls.ids]
+        left = lambda there, offset, u=fitted[cls.ids], at=at: _left_out(disc, nums, run.problem, there, offset, u, at)
+        missed[np.array(disc.rec.equation_rows)[:, None], at] = _around(disc, cls, points, left)
+    return _made_of(run, _with_source(nums, missed)) if missed.any() else None
+
+
+def _left_out(
+    disc: Discretization, nums: Numbers, problem: Problem, there: np.ndarray, offset: np.ndarray, u: np.ndarray,
+    at: np.ndarray,
+) -> np.ndarray:  # fmt: skip
+    """By how much the equation ``there`` is another than its series at the particles ``at`` say, (E, n)."""
+    rec = disc.rec
+    whole, jac, value = evaluated(disc, problem, there, offset, u)
+    source = np.einsum("esn,sn->en", jac, value) - whole  # on the right of the equation, as in the numbers
+    powers = np.stack([np.prod(offset ** np.array(c), axis=1) for c in multi_indices(rec.dim, rec.degree)])
+    degrees = np.array([sum(c) for c in multi_indices(rec.dim, rec.degree)])
+
+    def ended(known: Any, series: Any, degree: int) -> np.ndarray:
+        """What the series (..., T, n) lack of the known (..., n), where that is more than they promise."""
+        series = np.asarray(series, float)
+        terms = (series if series.shape[-1] == 1 else series[..., at]) * powers[: series.shape[-2]]
+        away, last = known - terms.sum(axis=-2), terms[..., degrees[: series.shape[-2]] > degree - 2, :].sum(axis=-2)
+        bad = (np.abs(away) > ENDED * np.abs(last)) & (np.abs(away) > FAINT * np.abs(known)) & np.isfinite(away)
+        return np.where(bad, away, 0.0)
+
+    found = np.einsum("esn,sn->en", ended(jac, nums.jac, rec.degree), value)
+    for e, degree in enumerate(rec.degrees):
+        rows = [k for k, (equation, _) in enumerate(rec.row_index) if equation == e]
+        found[e] -= ended(source[e], np.asarray(nums.source)[rows], degree)
+    return found
 
 
 def even(run: Any) -> bool:
