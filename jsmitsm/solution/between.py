@@ -77,8 +77,9 @@ def _left_out(
         """What the series (..., T, n) lack of the known (..., n), where that is more than they promise."""
         series = np.asarray(series, float)
         terms = (series if series.shape[-1] == 1 else series[..., at]) * powers[: series.shape[-2]]
-        away, last = known - terms.sum(axis=-2), terms[..., degrees[: series.shape[-2]] > degree - 2, :].sum(axis=-2)
-        bad = (np.abs(away) > ENDED * np.abs(last)) & (np.abs(away) > FAINT * np.abs(known)) & np.isfinite(away)
+        away, last = known - terms.sum(axis=-2), terms[..., degrees[: series.shape[-2]] > degree - 2, :]
+        promised = np.maximum(ENDED * np.abs(last).sum(axis=-2), FAINT * np.abs(known))
+        bad = np.isfinite(away) & (np.abs(away) > promised)
         return np.where(bad, away, 0.0)
 
     found = np.einsum("esn,sn->en", ended(jac, nums.jac, rec.degree), value)
