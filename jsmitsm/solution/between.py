@@ -37,9 +37,15 @@ ENDED, FAINT = 3.0, 1e-6
 def between(run: Any, values: Any) -> np.ndarray:
     """What the residual between the particles makes of the solution of a run, (N, F)."""
     disc = run.disc
-    if disc.linear and disc.traced.constant and disc.traced.source != "variable":
+    if same_everywhere(disc):
         return np.zeros(disc.held.shape)
-    return _made_of(run, unresolved(disc, run.nums, run.problem, values))
+    fitted = np.asarray(all_coefficients(disc, run.nums, values), float)
+    return _made_of(run, unresolved(disc, run.nums, run.problem, fitted))
+
+
+def same_everywhere(disc: Discretization) -> bool:
+    """Whether the equation is the same at every point."""
+    return disc.linear and disc.traced.constant and disc.traced.source != "variable"
 
 
 def beyond_kinks(run: Any, values: Any) -> np.ndarray | None:
@@ -49,17 +55,30 @@ def beyond_kinks(run: Any, values: Any) -> np.ndarray | None:
     kinks, or where the problem is nonlinear.
     """
     disc, nums = run.disc, run.nums
-    if nums is None or not disc.linear or not disc.traced.kinked or disc.rec.degree < 2 or run.factor is None:
+    if nums is None or not has_kinks(disc) or run.factor is None:
         return None
-    fitted = np.asarray(all_coefficients(disc, nums, values), float)
+    left_out = out_of_series(disc, nums, run.problem, np.asarray(all_coefficients(disc, nums, values), float))
+    return _made_of(run, left_out) if np.any(left_out.source) else None
+
+
+def has_kinks(disc: Discretization) -> bool:
+    """Whether series of a linear problem may end within a support."""
+    return disc.linear and disc.traced.kinked and disc.rec.degree >= 2
+
+
+def out_of_series(disc: Discretization, nums: Numbers, problem: Problem, fitted: np.ndarray) -> Numbers:
+    """The numbers of the same operator with, for its source, what the series leave out halfway to the neighbours.
+
+    fitted (N, F, K): the local polynomials.
+    """
     points, place = np.asarray(disc.points, float), np.full(len(disc.cloud), -1)
     place[nums.ids] = np.arange(len(nums.ids))
     missed = np.zeros((disc.rec.n_rows, len(nums.ids)))
     for cls in disc.classes:
         at = place[cls.ids]
-        left = lambda there, offset, u=fitted[cls.ids], at=at: _left_out(disc, nums, run.problem, there, offset, u, at)
+        left = lambda there, offset, u=fitted[cls.ids], at=at: _left_out(disc, nums, problem, there, offset, u, at)
         missed[np.array(disc.rec.equation_rows)[:, None], at] = _around(disc, cls, points, left)
-    return _made_of(run, _with_source(nums, missed)) if missed.any() else None
+    return with_source(nums, missed)
 
 
 def _left_out(
@@ -95,7 +114,7 @@ def even(run: Any) -> bool:
     A look without polynomials: where it sees nothing, there is no need of theirs.
     """
     disc, points = run.disc, np.asarray(run.disc.points, float)
-    if not disc.linear or disc.traced.constant and disc.traced.source != "variable":
+    if not disc.linear or same_everywhere(disc):
         return disc.linear
 
     def at(x: np.ndarray) -> np.ndarray:
@@ -123,31 +142,38 @@ def _looked_at(disc: Discretization, cls: Class) -> np.ndarray:
 
 
 def unseen_data(run: Any) -> np.ndarray:
-    """What boundary data do between the particles, unseen by them, makes of the solution of a run, (N, F).
+    """What boundary data do between the particles, unseen by them, makes of the solution of a run, (N, F)."""
+    unseen = data_between(run.disc, run.nums, run.problem)
+    if unseen is None:
+        return np.zeros(run.disc.held.shape)
+    made = _made_of(run, unseen)
+    # A velocity that is zero has no scale to measure what the other's data make of it with.
+    given_in = np.any(unseen.held, axis=0)
+    return np.where(given_in if given_in.any() else True, made, 0.0)
+
+
+def data_between(disc: Discretization, nums: Numbers, problem: Problem) -> Numbers | None:
+    """The numbers of the same operator with what its boundary data do between the particles alone; None: nothing.
 
     Data given by functions are looked at halfway to the nearest particles of the same group, and compared with the
     mean of both. A function that says there what it says at the particle has nothing to tell, nor has an array.
     """
-    disc, zero = run.disc, np.zeros_like
-    ways = 2 * (disc.rec.dim - 1)
+    zero, ways = np.zeros_like, 2 * (disc.rec.dim - 1)
     if not ways or not all(group.linear for group in disc.groups):
-        return np.zeros(disc.held.shape)
-    cloud = with_corners(run.problem, disc.cloud)
-    here = [np.asarray(x, float) for x in conditions_at(disc, run.problem, cloud)]
+        return None
+    cloud = with_corners(problem, disc.cloud)
+    here = [np.asarray(x, float) for x in conditions_at(disc, problem, cloud)]
     found = [zero(x) for x in here]
     own = np.flatnonzero(disc.n_own)
     for k in range(ways):
         moved, near = _halfway(disc, cloud, k)
-        there = conditions_at(disc, run.problem, moved)
+        there = conditions_at(disc, problem, moved)
         for total, a, b, other in zip(found, here, there, (near, np.searchsorted(own, near[own]), near)):
             total += np.where(a == b, 0.0, b - 0.5 * (a + a[other])) / ways
     if not any(x.any() for x in found):
-        return np.zeros(disc.held.shape)
+        return None
     held, given, gamma = found
-    made = _made_of(run, replace(run.nums, source=zero(run.nums.source), held=held, given=given, gamma=gamma))
-    # A velocity that is zero has no scale to measure what the other's data make of it with.
-    given_in = held.any(axis=0)
-    return np.where(given_in if given_in.any() else True, made, 0.0)
+    return replace(nums, source=zero(nums.source), held=held, given=given, gamma=gamma)
 
 
 def _halfway(disc: Discretization, cloud: Cloud, k: int) -> tuple[Cloud, np.ndarray]:
@@ -184,7 +210,7 @@ def seam(run: Any, values: Any) -> np.ndarray:
     """
     disc, nums = run.disc, run.nums
     aside = np.flatnonzero(disc.partner != np.arange(len(disc.cloud)))
-    if not len(aside) or disc.linear and disc.traced.constant and disc.traced.source != "variable":
+    if not len(aside) or same_everywhere(disc):
         return np.zeros(disc.held.shape)
     owner, points = disc.partner[aside], np.asarray(disc.cloud.points, float)
     fitted = np.asarray(all_coefficients(disc, nums, values), float)[owner]
@@ -197,7 +223,7 @@ def seam(run: Any, values: Any) -> np.ndarray:
     rows, at = np.array(disc.rec.equation_rows)[:, None], place[owner[known]]
     sides = 1 + np.bincount(at, minlength=len(nums.ids))[at]
     np.add.at(source, (rows, at), (missed[0] - missed[1])[:, known] / sides)
-    return _made_of(run, _with_source(nums, source))
+    return _made_of(run, with_source(nums, source))
 
 
 def _made_of(run: Any, nums: Numbers) -> np.ndarray:
@@ -213,28 +239,33 @@ def _made_of(run: Any, nums: Numbers) -> np.ndarray:
             disc.classes = [replace(cls, scheme=replace(cls.scheme, sourced=True)) for cls in classes]
             classes, rows = all_rows(disc, nums)
         right = right_side(disc, nums, classes, rows)
-    right, found = np.asarray(right), np.zeros(disc.held.size)
+    return solved_alone(run, np.asarray(right))
+
+
+def solved_alone(run: Any, right: np.ndarray) -> np.ndarray:
+    """The size of what a right-hand side alone makes of the solution of a run, (N, F)."""
+    disc, found = run.disc, np.zeros(run.disc.held.size)
     solved = run.factor.solve(np.concatenate([right, np.zeros(run.factor.n - len(right))]))
     found[~disc.held.reshape(-1)] = np.abs(solved[: len(right)])
     return found.reshape(disc.held.shape)
 
 
-def unresolved(disc: Discretization, nums: Numbers, problem: Problem, values: Any) -> Numbers:
+def unresolved(disc: Discretization, nums: Numbers, problem: Problem, fitted: np.ndarray) -> Numbers:
     """The numbers of the same operator with, for its source, what the polynomials leave of the residual.
 
     The residual is looked at halfway to the nearest neighbours, and averaged: a source or a coefficient that the
-    particles do not see, or whose Taylor series ends before it reaches the neighbours, shows there.
+    particles do not see, or whose Taylor series ends before it reaches the neighbours, shows there. fitted (N, F, K):
+    the local polynomials.
     """
-    fitted = np.asarray(all_coefficients(disc, nums, values), float)
     points, place = np.asarray(disc.points, float), np.full(len(disc.cloud), -1)
     place[nums.ids] = np.arange(len(nums.ids))
     source = np.zeros((disc.rec.n_rows, len(nums.ids)))
     for cls in disc.classes:
         source[np.array(disc.rec.equation_rows)[:, None], place[cls.ids]] = _mean(disc, problem, cls, points, fitted)
-    return _with_source(nums, source)
+    return with_source(nums, source)
 
 
-def _with_source(nums: Numbers, source: np.ndarray) -> Numbers:
+def with_source(nums: Numbers, source: np.ndarray) -> Numbers:
     """The numbers of the same operator with this source and no data."""
     zero = np.zeros_like
     return replace(nums, source=source, held=zero(nums.held), given=zero(nums.given), gamma=zero(nums.gamma))
