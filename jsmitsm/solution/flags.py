@@ -60,8 +60,8 @@ PHASE = (0.9, 3.5)
 
 # An estimated error below this part of the solution clears what only suspects the resolution ...
 CLEARED = 0.02
-# ... unless what is missed between the particles would make so much of the solution.
-MISSED = 1.0
+# ... unless what is missed between the particles would make so much of the solution, or where the source says so too.
+MISSED, AGREED = 1.0, 0.3
 # ... or boundary data so much: seven particles a wavelength leave an eighth of the data.
 DATA = 0.3
 # Where the highest derivatives change their sign, a smooth solution has a smaller estimated error than this.
@@ -119,7 +119,7 @@ def _unseen(run: Any, values: np.ndarray, found: dict[str, float], nothing: bool
     found["data"] = data = share(unseen_data(run), values)
     found["seam"] = beyond = share(seam(run, values), values)
     told = []
-    if missed > MISSED:
+    if missed > (AGREED if found.get("source", 0.0) > SOURCE else MISSED):
         told.append(
             f"Between the particles the equation is missed by as much as makes {missed:.0%} of the solution: the "
             "source or a coefficient changes within the spacing, unseen by the particles; refine there, or smooth it."
