@@ -15,14 +15,12 @@ from jsmitsm.runtime.arrays import Array
 from jsmitsm.runtime.errors import SolveError, explained, explaining
 from jsmitsm.runtime.tracers import frozen, is_traced, owned
 from jsmitsm.solution.anywhere import Anywhere
-from jsmitsm.solution.between import beyond_kinks
 from jsmitsm.solution.estimate import Correction, correction
 from jsmitsm.solution.fit import Recipe
-from jsmitsm.solution.flags import NOTHING, SQUARED, share
+from jsmitsm.solution.flags import SQUARED, too_large
+from jsmitsm.solution.look.between import beyond_kinks
+from jsmitsm.solution.look.sizes import NOTHING, share
 from jsmitsm.solution.run import Run
-
-# An estimated error above this part of the solution is a flag.
-LARGE = 0.02
 
 
 class Report(Protocol):
@@ -159,7 +157,7 @@ class Solution(Anywhere):
     def _size(self, found: Correction) -> Array:
         """The size of an estimated error, kept for the next who asks."""
         error = abs(found.error)
-        if isinstance(self._report, Run):
+        if isinstance(self._report, Run) and not is_traced(error, self._values):
             beyond = beyond_kinks(self._report, self._values)
             error = error if beyond is None else np.maximum(error, beyond)
         return self._kept(error[..., 0] if self._recipe.fields == 1 else error, found.units)
@@ -236,9 +234,7 @@ class Solution(Anywhere):
         self.refuse_stacked()
         if self._found is None and self._report is not None:
             self._found = self._report.flags(self._estimated)
-        large = f"The estimated error is {self._share:.0%} of the solution: refine the cloud, or change the order."
-        found = [*(self._found or []), *self.stats.get("objections", []), *([] if self._share <= LARGE else [large])]
-        return explained(found)
+        return explained([*(self._found or []), *self.stats.get("objections", []), *too_large(self._share)])
 
     @explaining
     def condition_numbers(self) -> tuple[np.ndarray, float]:

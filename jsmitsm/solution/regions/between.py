@@ -10,7 +10,8 @@ import numpy as np
 from jsmitsm.discretization.coefficients import Numbers
 from jsmitsm.discretization.regions.layout import Part
 from jsmitsm.discretization.regions.rows import RegionNumbers, spread, whole_coefficients, whole_right_side
-from jsmitsm.solution.between import (
+from jsmitsm.solution.flags import CLEARED, DATA, MISSED
+from jsmitsm.solution.look.between import (
     data_between,
     has_kinks,
     out_of_series,
@@ -19,7 +20,7 @@ from jsmitsm.solution.between import (
     unresolved,
     with_source,
 )
-from jsmitsm.solution.flags import CLEARED, DATA, MISSED, share
+from jsmitsm.solution.look.sizes import share
 
 
 def unseen(run: Any, values: np.ndarray) -> list[str]:

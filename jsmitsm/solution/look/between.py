@@ -17,6 +17,7 @@ from jsmitsm.discretization.coefficients import Numbers, conditions_at
 from jsmitsm.discretization.layout import Class, Discretization
 from jsmitsm.discretization.least_squares import least_squares
 from jsmitsm.discretization.leave_one_out import right_side
+from jsmitsm.discretization.parts.whole import whole
 from jsmitsm.discretization.periodic import with_corners
 from jsmitsm.discretization.resolution.residuals import evaluated, residual
 from jsmitsm.discretization.rows import all_coefficients, all_rows
@@ -39,8 +40,7 @@ def between(run: Any, values: Any) -> np.ndarray:
     disc = run.disc
     if same_everywhere(disc):
         return np.zeros(disc.held.shape)
-    fitted = np.asarray(all_coefficients(disc, run.nums, values), float)
-    return _made_of(run, unresolved(disc, run.nums, run.problem, fitted))
+    return _made_of(run, unresolved(disc, run.nums, run.problem, run.fitted(run.nums, values)))
 
 
 def same_everywhere(disc: Discretization) -> bool:
@@ -57,8 +57,8 @@ def beyond_kinks(run: Any, values: Any) -> np.ndarray | None:
     disc, nums = run.disc, run.nums
     if nums is None or not has_kinks(disc) or run.factor is None:
         return None
-    left_out = out_of_series(disc, nums, run.problem, np.asarray(all_coefficients(disc, nums, values), float))
-    return _made_of(run, left_out) if np.any(left_out.source) else None
+    left_out = out_of_series(disc, nums, run.problem, run.fitted(nums, values))
+    return _made_of(run, left_out) if whole(disc).total(int(np.any(left_out.source))) else None
 
 
 def has_kinks(disc: Discretization) -> bool:
@@ -87,8 +87,8 @@ def _left_out(
 ) -> np.ndarray:  # fmt: skip
     """By how much the equation ``there`` is another than its series at the particles ``at`` say, (E, n)."""
     rec = disc.rec
-    whole, jac, value = evaluated(disc, problem, there, offset, u)
-    source = np.einsum("esn,sn->en", jac, value) - whole  # on the right of the equation, as in the numbers
+    residual_there, jac, value = evaluated(disc, problem, there, offset, u)
+    source = np.einsum("esn,sn->en", jac, value) - residual_there  # on the right of the equation, as in the numbers
     powers = np.stack([np.prod(offset ** np.array(c), axis=1) for c in multi_indices(rec.dim, rec.degree)])
     degrees = np.array([sum(c) for c in multi_indices(rec.dim, rec.degree)])
 
@@ -113,7 +113,7 @@ def even(run: Any) -> bool:
 
     A look without polynomials: where it sees nothing, there is no need of theirs.
     """
-    disc, points = run.disc, np.asarray(run.disc.points, float)
+    disc, points, told = run.disc, np.asarray(run.disc.points, float), whole(run.disc)
     if not disc.linear or same_everywhere(disc):
         return disc.linear
 
@@ -123,16 +123,18 @@ def even(run: Any) -> bool:
         return np.concatenate([np.broadcast_to(p, (*p.shape[:2], len(x))) for p in parts], axis=1)
 
     known = at(points)
-    largest = np.abs(known).max(axis=2, keepdims=True)
+    largest = told.most(np.abs(known).max(axis=2, keepdims=True))
+    uneven = False
     for cls in disc.classes:
         near = _looked_at(disc, cls)
         for other in near.T:
+            if uneven:
+                break
             ids, to = cls.ids[other >= 0], other[other >= 0]
             there, ends = at(0.5 * (points[ids] + points[to])), (known[:, :, ids], known[:, :, to])
             size = np.maximum(np.maximum(*map(np.abs, ends)), SMALL * largest)
-            if (np.abs(there - 0.5 * (ends[0] + ends[1])) > UNEVEN * size).any():
-                return False
-    return True
+            uneven = bool((np.abs(there - 0.5 * (ends[0] + ends[1])) > UNEVEN * size).any())
+    return not told.most(float(uneven))
 
 
 def _looked_at(disc: Discretization, cls: Class) -> np.ndarray:
@@ -148,7 +150,7 @@ def unseen_data(run: Any) -> np.ndarray:
         return np.zeros(run.disc.held.shape)
     made = _made_of(run, unseen)
     # A velocity that is zero has no scale to measure what the other's data make of it with.
-    given_in = np.any(unseen.held, axis=0)
+    given_in = whole(run.disc).total(np.any(unseen.held, axis=0).astype(int)) > 0
     return np.where(given_in if given_in.any() else True, made, 0.0)
 
 
@@ -158,8 +160,8 @@ def data_between(disc: Discretization, nums: Numbers, problem: Problem) -> Numbe
     Data given by functions are looked at halfway to the nearest particles of the same group, and compared with the
     mean of both. A function that says there what it says at the particle has nothing to tell, nor has an array.
     """
-    zero, ways = np.zeros_like, 2 * (disc.rec.dim - 1)
-    if not ways or not all(group.linear for group in disc.groups):
+    zero, ways, told = np.zeros_like, 2 * (disc.rec.dim - 1), whole(disc)
+    if not ways or told.total(sum(not group.linear for group in disc.groups)):
         return None
     cloud = with_corners(problem, disc.cloud)
     here = [np.asarray(x, float) for x in conditions_at(disc, problem, cloud)]
@@ -170,7 +172,7 @@ def data_between(disc: Discretization, nums: Numbers, problem: Problem) -> Numbe
         there = conditions_at(disc, problem, moved)
         for total, a, b, other in zip(found, here, there, (near, np.searchsorted(own, near[own]), near)):
             total += np.where(a == b, 0.0, b - 0.5 * (a + a[other])) / ways
-    if not any(x.any() for x in found):
+    if not told.total(sum(int(x.any()) for x in found)):
         return None
     held, given, gamma = found
     return replace(nums, source=zero(nums.source), held=held, given=given, gamma=gamma)
@@ -244,18 +246,19 @@ def _made_of(run: Any, nums: Numbers) -> np.ndarray:
 
 def solved_alone(run: Any, right: np.ndarray) -> np.ndarray:
     """The size of what a right-hand side alone makes of the solution of a run, (N, F)."""
-    disc, found = run.disc, np.zeros(run.disc.held.size)
+    disc, found = run.disc, np.zeros(run.disc.held.shape)
     solved = run.factor.solve(np.concatenate([right, np.zeros(run.factor.n - len(right))]))
-    found[~disc.held.reshape(-1)] = np.abs(solved[: len(right)])
-    return found.reshape(disc.held.shape)
+    own = disc.part.own[:, None] if disc.part is not None else True
+    found[~disc.held & own] = np.abs(solved[: len(right)])
+    return found
 
 
 def unresolved(disc: Discretization, nums: Numbers, problem: Problem, fitted: np.ndarray) -> Numbers:
     """The numbers of the same operator with, for its source, what the polynomials leave of the residual.
 
-    The residual is looked at halfway to the nearest neighbours, and averaged: a source or a coefficient that the
-    particles do not see, or whose Taylor series ends before it reaches the neighbours, shows there. fitted (N, F, K):
-    the local polynomials.
+    fitted (N, F, K): these polynomials. The residual is looked at halfway to the nearest neighbours, and averaged: a
+    source or a coefficient that the particles do not see, or whose Taylor series ends before it reaches the neighbours,
+    shows there.
     """
     points, place = np.asarray(disc.points, float), np.full(len(disc.cloud), -1)
     place[nums.ids] = np.arange(len(nums.ids))
