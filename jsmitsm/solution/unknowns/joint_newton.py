@@ -246,7 +246,7 @@ def _first(run: Bordered, u0: Any) -> tuple[Any, Any]:
         taylor = np.pad(taylor, ((0, 0), (0, 0), (0, less)))
     if is_traced(good):
         good = good & jnp.isfinite(values).all() & jnp.isfinite(taylor).all()
-        return tuple(jnp.where(good, x, y) for x, y in zip((values, taylor), here))
+        return jnp.where(good, values, here[0]), jnp.where(good, taylor, here[1])
     return values, taylor
 
 
