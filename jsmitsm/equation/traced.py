@@ -35,6 +35,8 @@ KINKS = frozenset(
     "abs max min clamp sign floor ceil round rem select_n reduce_max reduce_min cummax cummin argmax argmin sort "
     "gather dynamic_slice cond while atan2".split()
 )
+# Operations that may be infinite at a point; powers of whole numbers are, where these are negative.
+POLES = frozenset("div pow log log1p rsqrt tan lgamma digamma".split())
 
 
 @jax.tree_util.register_pytree_node_class
@@ -165,9 +167,17 @@ class Traced:
     @cached_property
     def kinked_source(self) -> bool:
         """Whether the source may have kinks or jumps, where its Taylor series end, and the coefficients have none."""
-        needed = lambda jac: levels(self._record.jaxpr, self._wanted(jac, not jac))  # noqa: E731
-        source, operator = (any(_kinked(eqn) for eqn, _ in needed(jac)) for jac in (False, True))
-        return source and not operator
+        return self._has(KINKS, False) and not self._has(KINKS, True)
+
+    @cached_property
+    def unbounded_source(self) -> bool:
+        """Whether the source may be infinite somewhere: whether it is made of what is."""
+        return self._has(POLES, False)
+
+    def _has(self, names: frozenset[str], operator: bool) -> bool:
+        """Whether one of these primitives is needed for the coefficients of the operator, or for the source."""
+        needed = levels(self._record.jaxpr, self._wanted(operator, not operator))
+        return any(_made_of(names, eqn) for eqn, _ in needed)
 
     def with_any_numbers(self) -> Traced:
         """The same with some numbers for the constants that are only traced."""
@@ -360,8 +370,11 @@ class _Inputs:
         return self._replace(points=self.points[cut], extras=[e[cut] for e in self.extras], slots=slots)
 
 
-def _kinked(eqn: Any) -> bool:
-    return eqn.primitive.name in KINKS or any(_kinked(e) for inner in inner_jaxprs(eqn) for e in inner.eqns)
+def _made_of(names: frozenset[str], eqn: Any) -> bool:
+    name = eqn.primitive.name
+    if name == "integer_pow" and eqn.params["y"] < 0:
+        name = "div"
+    return name in names or any(_made_of(names, e) for inner in inner_jaxprs(eqn) for e in inner.eqns)
 
 
 def _zeros(value: Any) -> np.ndarray:
