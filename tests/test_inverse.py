@@ -45,7 +45,7 @@ class Plate:
         near = np.argmin(np.linalg.norm(self.cloud.points - self.places[:, None], axis=2), axis=1)
 
         def readings(p):
-            u = js.solve(heated(p), self.cloud, stencils=stencils, solver="dense").u[near]
+            u = js.solve(heated(p), self.cloud, stencils=stencils, solver="dense", depth=0).u[near]
             return u, u
 
         self.places = self.cloud.points[near]
@@ -104,7 +104,7 @@ def bulged(n, order):
         up = jnp.stack([-slope, jnp.ones_like(slope)], axis=1) / jnp.sqrt(1.0 + slope**2)[:, None]
         normals = jnp.where(np.isin(np.arange(len(x)), flat.groups["top"])[:, None], up, flat.normals)
         moved = flat.replace(points=points, normals=normals)
-        return js.solve(problem, moved, order=order, stencils=near, solver="dense")
+        return js.solve(problem, moved, order=order, stencils=near, solver="dense", depth=0)
 
     return solution
 

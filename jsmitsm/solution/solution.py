@@ -17,11 +17,9 @@ from jsmitsm.runtime.tracers import frozen, is_traced, owned
 from jsmitsm.solution.anywhere import Anywhere
 from jsmitsm.solution.estimate import Correction, correction
 from jsmitsm.solution.fit import Recipe
-from jsmitsm.solution.flags import NOTHING, SQUARED, share
+from jsmitsm.solution.flags import SQUARED, too_large
+from jsmitsm.solution.look.sizes import NOTHING, share
 from jsmitsm.solution.run import Run
-
-# An estimated error above this part of the solution is a flag.
-LARGE = 0.02
 
 
 class Report(Protocol):
@@ -231,9 +229,7 @@ class Solution(Anywhere):
         self.refuse_stacked()
         if self._found is None and self._report is not None:
             self._found = self._report.flags(self._estimated)
-        large = f"The estimated error is {self._share:.0%} of the solution: refine the cloud, or change the order."
-        found = [*(self._found or []), *self.stats.get("objections", []), *([] if self._share <= LARGE else [large])]
-        return explained(found)
+        return explained([*(self._found or []), *self.stats.get("objections", []), *too_large(self._share)])
 
     @explaining
     def condition_numbers(self) -> tuple[np.ndarray, float]:

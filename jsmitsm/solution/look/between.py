@@ -17,6 +17,7 @@ from jsmitsm.discretization.coefficients import Numbers, conditions_at
 from jsmitsm.discretization.layout import Class, Discretization
 from jsmitsm.discretization.least_squares import least_squares
 from jsmitsm.discretization.leave_one_out import right_side
+from jsmitsm.discretization.parts.whole import whole
 from jsmitsm.discretization.periodic import with_corners
 from jsmitsm.discretization.resolution.residuals import residual
 from jsmitsm.discretization.rows import all_coefficients, all_rows
@@ -35,7 +36,7 @@ def between(run: Any, values: Any) -> np.ndarray:
     disc = run.disc
     if disc.linear and disc.traced.constant and disc.traced.source != "variable":
         return np.zeros(disc.held.shape)
-    return _made_of(run, unresolved(disc, run.nums, run.problem, values))
+    return _made_of(run, unresolved(disc, run.nums, run.problem, run.fitted(run.nums, values)))
 
 
 def even(run: Any) -> bool:
@@ -43,7 +44,7 @@ def even(run: Any) -> bool:
 
     A look without polynomials: where it sees nothing, there is no need of theirs.
     """
-    disc, points = run.disc, np.asarray(run.disc.points, float)
+    disc, points, told = run.disc, np.asarray(run.disc.points, float), whole(run.disc)
     if not disc.linear or disc.traced.constant and disc.traced.source != "variable":
         return disc.linear
 
@@ -53,16 +54,18 @@ def even(run: Any) -> bool:
         return np.concatenate([np.broadcast_to(p, (*p.shape[:2], len(x))) for p in parts], axis=1)
 
     known = at(points)
-    largest = np.abs(known).max(axis=2, keepdims=True)
+    largest = told.most(np.abs(known).max(axis=2, keepdims=True))
+    uneven = False
     for cls in disc.classes:
         near = _looked_at(disc, cls)
         for other in near.T:
+            if uneven:
+                break
             ids, to = cls.ids[other >= 0], other[other >= 0]
             there, ends = at(0.5 * (points[ids] + points[to])), (known[:, :, ids], known[:, :, to])
             size = np.maximum(np.maximum(*map(np.abs, ends)), SMALL * largest)
-            if (np.abs(there - 0.5 * (ends[0] + ends[1])) > UNEVEN * size).any():
-                return False
-    return True
+            uneven = bool((np.abs(there - 0.5 * (ends[0] + ends[1])) > UNEVEN * size).any())
+    return not told.most(float(uneven))
 
 
 def _looked_at(disc: Discretization, cls: Class) -> np.ndarray:
@@ -77,9 +80,9 @@ def unseen_data(run: Any) -> np.ndarray:
     Data given by functions are looked at halfway to the nearest particles of the same group, and compared with the
     mean of both. A function that says there what it says at the particle has nothing to tell, nor has an array.
     """
-    disc, zero = run.disc, np.zeros_like
+    disc, zero, told = run.disc, np.zeros_like, whole(run.disc)
     ways = 2 * (disc.rec.dim - 1)
-    if not ways or not all(group.linear for group in disc.groups):
+    if not ways or told.total(sum(not group.linear for group in disc.groups)):
         return np.zeros(disc.held.shape)
     cloud = with_corners(run.problem, disc.cloud)
     here = [np.asarray(x, float) for x in conditions_at(disc, run.problem, cloud)]
@@ -90,12 +93,12 @@ def unseen_data(run: Any) -> np.ndarray:
         there = conditions_at(disc, run.problem, moved)
         for total, a, b, other in zip(found, here, there, (near, np.searchsorted(own, near[own]), near)):
             total += np.where(a == b, 0.0, b - 0.5 * (a + a[other])) / ways
-    if not any(x.any() for x in found):
+    if not told.total(sum(int(x.any()) for x in found)):
         return np.zeros(disc.held.shape)
     held, given, gamma = found
     made = _made_of(run, replace(run.nums, source=zero(run.nums.source), held=held, given=given, gamma=gamma))
     # A velocity that is zero has no scale to measure what the other's data make of it with.
-    given_in = held.any(axis=0)
+    given_in = told.total(held.any(axis=0).astype(int)) > 0
     return np.where(given_in if given_in.any() else True, made, 0.0)
 
 
@@ -162,19 +165,20 @@ def _made_of(run: Any, nums: Numbers) -> np.ndarray:
             disc.classes = [replace(cls, scheme=replace(cls.scheme, sourced=True)) for cls in classes]
             classes, rows = all_rows(disc, nums)
         right = right_side(disc, nums, classes, rows)
-    right, found = np.asarray(right), np.zeros(disc.held.size)
+    right, found = np.asarray(right), np.zeros(disc.held.shape)
     solved = run.factor.solve(np.concatenate([right, np.zeros(run.factor.n - len(right))]))
-    found[~disc.held.reshape(-1)] = np.abs(solved[: len(right)])
-    return found.reshape(disc.held.shape)
+    own = disc.part.own[:, None] if disc.part is not None else True
+    found[~disc.held & own] = np.abs(solved[: len(right)])
+    return found
 
 
-def unresolved(disc: Discretization, nums: Numbers, problem: Problem, values: Any) -> Numbers:
+def unresolved(disc: Discretization, nums: Numbers, problem: Problem, fitted: np.ndarray) -> Numbers:
     """The numbers of the same operator with, for its source, what the polynomials leave of the residual.
 
-    The residual is looked at halfway to the nearest neighbours, and averaged: a source or a coefficient that the
-    particles do not see, or whose Taylor series ends before it reaches the neighbours, shows there.
+    fitted (N, F, K): these polynomials. The residual is looked at halfway to the nearest neighbours, and averaged: a
+    source or a coefficient that the particles do not see, or whose Taylor series ends before it reaches the neighbours,
+    shows there.
     """
-    fitted = np.asarray(all_coefficients(disc, nums, values), float)
     points, place = np.asarray(disc.points, float), np.full(len(disc.cloud), -1)
     place[nums.ids] = np.arange(len(nums.ids))
     source = np.zeros((disc.rec.n_rows, len(nums.ids)))
