@@ -30,7 +30,8 @@ _FRESH, _BESIDE = 0.15, 3.0
 _NEAR, _WORST = 8, 12
 # Rows reach so many spacings far, about, and the error that a singular point makes.
 _REACH, _AFFECTED = 4.0, 25.0
-# A point may keep this part of the whole error: its decades of spacing are as dear as all other particles together.
+# A point may keep all of the error, which is estimated there at this part of what it is: its decades of spacing are as
+# dear as all other particles together.
 _POINT = 0.5
 # Of a line of them there are at least so many within so many spacings.
 _ALONG, _FEW = 12.0, 5

@@ -68,6 +68,7 @@ class Rounds:
         self.clock = began
         self.solution: Solution = None  # type: ignore[assignment]
         self.error, self.reached = np.inf, False
+        self.undoubted = np.inf  # the error without the doubt where smoothness ends, which marking has as well
         self.number: float | None = None
         self.number_before: float | None = None
         self.flags: list[str] = []
@@ -137,7 +138,7 @@ class Rounds:
         now = time.perf_counter()
         self.rows.append((len(cloud), order, found.error, now - self.clock, float(h.min())))
         self.clock = now
-        self.solution, self.error = sol, found.error
+        self.solution, self.error, self.undoubted = sol, found.error, found.error
         self.number_before, self.number = self.number, found.number
         return sol, found
 
@@ -220,7 +221,8 @@ class Rounds:
                 self.apart = apart
             else:
                 self.error = max(self.error, between)
-        self.error = max(self.error, self._doubted(found, cloud, spacing), self._disagreed())
+        self.undoubted = max(self.error, self._disagreed())
+        self.error = max(self.undoubted, self._doubted(found, cloud, spacing))
         self.reached = self.error <= self.tol and not self.flags and self.apart is None
         return self.reached
 
@@ -275,7 +277,7 @@ class Rounds:
 
     def _next(self, found: Measured, cloud: Cloud, spacing: SpacingField) -> tuple[SpacingField, Cloud] | None:
         points, h = np.asarray(cloud.points), spacing(np.asarray(cloud.points))
-        power, error = self._power(cloud), self.error if np.isfinite(self.error) else 1e3
+        power, error = self._power(cloud), self.undoubted if np.isfinite(self.undoubted) else 1e3
         apart, self.apart = self.apart, None
         here = self._marks(found, cloud, spacing)
         self.before = here if np.isfinite(found.error) else None
@@ -283,7 +285,7 @@ class Rounds:
             self._limit(f"the {self.max_particles} particles that were allowed (max_particles)")
             return None
         most = min(max(_GROWTH * len(cloud), _SMALL[cloud.dim]), self.max_particles)
-        wanted = _EASED * self.tol if apart is not None else self.tol if error > self.tol else 0.5 * error
+        wanted = _EASED * self.tol if apart is not None else self.tol if self.error > self.tol else 0.5 * error
         made_h, _ = next_spacing(here, power, error, wanted, most, found.gathered)
         if apart is not None:
             parted = marks(points, h, apart, power, None, expected=_PARTED)
