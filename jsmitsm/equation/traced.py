@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jsmitsm.equation.branches import Branches
+from jsmitsm.equation.branches import Branches, decides
 from jsmitsm.equation.jumps import jumps
 from jsmitsm.equation.linearizing import Record, open_fields, slots_of
 from jsmitsm.equation.record_form import Form, is_fixed
@@ -30,11 +30,8 @@ REMEMBERED = 6000
 CHUNK, LEAST = 60_000, 512
 # How many programs were traced for compilation since import; tests watch it.
 COMPILATIONS = 0
-# Operations on floats whose value or slope may jump; look-ups in tables are among them.
-KINKS = frozenset(
-    "abs max min clamp sign floor ceil round rem select_n reduce_max reduce_min cummax cummin argmax argmin sort "
-    "gather dynamic_slice cond while atan2".split()
-)
+# Operations on floats whose slope may jump, beside those whose outcomes choose or look up something.
+KINKS = frozenset("abs max min clamp reduce_max reduce_min cummax cummin sort".split())
 # Operations that may be infinite at a point; powers of whole numbers are, where these are negative.
 POLES = frozenset("div pow log log1p rsqrt tan lgamma digamma".split())
 
@@ -164,20 +161,30 @@ class Traced:
         consts = r.consts[len(r.consts) - len(r.written.constvars) :]
         return open_fields(r.written, consts, [x, *jax.tree.leaves(params)], asked)[0]
 
-    @cached_property
+    @property
     def kinked_source(self) -> bool:
         """Whether the source may have kinks or jumps, where its Taylor series end, and the coefficients have none."""
-        return self._has(KINKS, False) and not self._has(KINKS, True)
+        return self._kinks == (True, False)
+
+    @property
+    def kinked(self) -> bool:
+        """Whether the source or a coefficient may have kinks or jumps."""
+        return any(self._kinks)
+
+    @cached_property
+    def _kinks(self) -> tuple[bool, bool]:
+        """Whether the source may have kinks or jumps, and whether the coefficients may."""
+        source, operator = (any(_kinked(eqn) for eqn in self._needed(jac)) for jac in (False, True))
+        return source, operator
 
     @cached_property
     def unbounded_source(self) -> bool:
-        """Whether the source may be infinite somewhere: whether it is made of what is."""
-        return self._has(POLES, False)
+        """Whether the source may be infinite somewhere."""
+        return any(_unbounded(eqn) for eqn in self._needed(False))
 
-    def _has(self, names: frozenset[str], operator: bool) -> bool:
-        """Whether one of these primitives is needed for the coefficients of the operator, or for the source."""
-        needed = levels(self._record.jaxpr, self._wanted(operator, not operator))
-        return any(_made_of(names, eqn) for eqn, _ in needed)
+    def _needed(self, jac: bool) -> list[Any]:
+        """The operations that the coefficients, or the source, are made by."""
+        return [eqn for eqn, _ in levels(self._record.jaxpr, self._wanted(jac, not jac))]
 
     def with_any_numbers(self) -> Traced:
         """The same with some numbers for the constants that are only traced."""
@@ -370,11 +377,15 @@ class _Inputs:
         return self._replace(points=self.points[cut], extras=[e[cut] for e in self.extras], slots=slots)
 
 
-def _made_of(names: frozenset[str], eqn: Any) -> bool:
+def _kinked(eqn: Any) -> bool:
+    own = eqn.primitive.name in KINKS or decides(eqn)
+    return own or any(_kinked(e) for inner in inner_jaxprs(eqn) for e in inner.eqns)
+
+
+def _unbounded(eqn: Any) -> bool:
     name = eqn.primitive.name
-    if name == "integer_pow" and eqn.params["y"] < 0:
-        name = "div"
-    return name in names or any(_made_of(names, e) for inner in inner_jaxprs(eqn) for e in inner.eqns)
+    own = name in POLES or name == "integer_pow" and eqn.params["y"] < 0
+    return own or any(_unbounded(e) for inner in inner_jaxprs(eqn) for e in inner.eqns)
 
 
 def _zeros(value: Any) -> np.ndarray:
