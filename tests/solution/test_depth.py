@@ -136,6 +136,21 @@ def test_a_series_that_diverges_beside_a_line_gives_way_to_values():
     assert np.abs(sol.u - right).max() < 3e-3 * np.abs(right).max()
 
 
+def test_around_a_point_where_the_source_is_infinite_its_values_tell():
+    """u = r, whose source is 1 / r: beside the corner its series made 80 of 1e-4, on spacings that shrink toward it."""
+    radius = lambda x: jnp.sqrt(x @ x)
+    cloud = js.from_polygon(
+        [(0, 0), (1, 0), (1, 1), (0, 1)], lambda x: np.clip(0.25 * np.linalg.norm(x, axis=1), 1e-4, 0.2)
+    )
+    problem = js.Problem(lambda u, x: js.laplacian(u)(x) - 1.0 / radius(x), {"boundary": js.dirichlet(radius)})
+    sol = js.solve(problem, cloud, order=6)
+    right = np.linalg.norm(cloud.points, axis=1)
+    near = right < 1e-3
+    assert sol.depth == 4 and near.sum() > 10
+    # Every value there is below 1e-3, and a straight line through the values of a spacing misses a tenth of them.
+    assert np.abs(sol.u - right)[near].max() < 1e-4
+
+
 def test_a_kink_outside_of_the_domain_changes_nothing():
     smooth, kinked = (lambda x: wave(x) + (x[0] + 1.0) ** 3 / 6.0), (lambda x: x[0] + 1.0)
     held = {s: js.dirichlet(smooth) for s in SIDES}
@@ -154,6 +169,19 @@ def test_gradients_through_a_deep_solve(formulation, bent):
         ends = {"left": js.dirichlet(1.0), "right": js.dirichlet(lambda x, a: a)}
         sol = js.solve(js.Problem(pde, ends, params=a), ROD, order=4, depth=4, formulation=formulation)
         return jnp.sum(sol.u**2) + sol(jnp.array([[0.33]]))[0]
+
+    step = 1e-5
+    expected = (value(3.0 + step) - value(3.0 - step)) / (2 * step)
+    assert jax.grad(value)(3.0) == pytest.approx(float(expected), rel=1e-6)
+
+
+def test_gradients_where_the_source_is_infinite():
+    """At an end; what an infinite value does to its own derivatives does not spread."""
+
+    def value(a):
+        pde = lambda u, x, a: js.laplacian(u)(x) - a * x[0] ** (-0.1 * a)
+        ends = {"left": js.dirichlet(1.0), "right": js.dirichlet(0.0)}
+        return jnp.sum(js.solve(js.Problem(pde, ends, params=a), ROD, order=4, depth=4).u ** 2)
 
     step = 1e-5
     expected = (value(3.0 + step) - value(3.0 - step)) / (2 * step)
