@@ -129,7 +129,7 @@ def discretize(
     rec = recursion(cloud.dim, order, problem.fields, traced.slots, traced.pattern, traced.order)
     flat = traced.constant and rec.scale_free
     if depth == "auto":
-        depth = suited_depth(method, rec, flat, sourced)
+        depth = suited_depth(method, rec, flat, sourced, traced, cloud, problem.params, part)
         depth = depth and min(depth, room(rec, order, traced, cloud, problem.params, part))
     rec = recursion(cloud.dim, order, problem.fields, traced.slots, traced.pattern, traced.order, int(depth))
     groups = group_conditions(problem, with_corners(problem, cloud), order, traced.order, part is None)
