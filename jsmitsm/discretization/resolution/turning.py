@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
 from jsmitsm.cloud.cloud import Cloud
@@ -13,7 +14,7 @@ from jsmitsm.discretization.supports import Part, default_size
 from jsmitsm.equation.traced import Traced
 from jsmitsm.particle.elimination import Scheme
 from jsmitsm.particle.recursion import Recursion
-from jsmitsm.runtime.tracers import concrete, is_traced
+from jsmitsm.runtime.tracers import concrete
 from jsmitsm.taylor.multi_indices import factorial, multi_indices
 
 # Particles that are looked at, and the degree of their series: fourth derivatives tell waves from slopes.
@@ -42,14 +43,15 @@ def turning(rec: Recursion, traced: Traced, cloud: Cloud, params: Any, part: Par
     None where nothing can be known of them beforehand, or where supports are of very different sizes.
     """
     points = concrete(cloud.points)
-    if rec.fields > 1 or points is None or not traced.linear or traced.kinked_source or is_traced(params):
+    if rec.fields > 1 or points is None or not traced.linear or traced.kinked_source:
         return None
+    if any(concrete(x) is None for x in jax.tree.leaves((traced, params))):
+        return None
+    traced, params = jax.tree.map(concrete, (traced, params))  # what only carries derivatives changes nothing
     sample, radius = _sample(np.asarray(points), default_size(Scheme("S", rec), True), part)
     if radius is None:
         return None
     jac, residual = traced.coefficients(sample, DEGREE, params=params)
-    if is_traced(jac, residual):
-        return None
     source = np.zeros(2) if residual is None else _sizes(rec.dim, np.asarray(residual)[0], radius)
     lower = np.array([rec.orders[0] - sum(b) for _, b in rec.slots])
     start, end = np.array([_sizes(rec.dim, np.asarray(c), radius) for c in jac[0]]).T * radius**lower
