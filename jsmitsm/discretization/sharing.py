@@ -13,7 +13,7 @@ from jsmitsm.discretization.coefficients import Numbers
 from jsmitsm.discretization.layout import Class, Discretization
 from jsmitsm.particle.recursion import fit_and_tail
 from jsmitsm.runtime.progress import each, shown
-from jsmitsm.runtime.size_classes import cloud_size, padded_size
+from jsmitsm.runtime.size_classes import cloud_size, open_size
 from jsmitsm.runtime.threads import cores, side_by_side
 from jsmitsm.runtime.tracers import closes_over_traced, is_traced, recorded
 
@@ -44,7 +44,7 @@ def on_all_cores(
     """``one`` of all classes, or pieces of them, side by side where nothing is traced."""
 
     def program(cls: Class) -> Any:
-        sizes = cloud_size(len(disc.points)), padded_size(len(cls.ids), 4), cls.neighbours.shape[1]
+        sizes = cloud_size(len(disc.points)), open_size(len(cls.ids)), cls.neighbours.shape[1]
         return one.__qualname__, cls.scheme, sizes, disc.kernel is None
 
     mapped = partial(side_by_side, program=program) if _to_share(disc, nums, classes, *more) else map

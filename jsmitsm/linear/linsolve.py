@@ -27,6 +27,7 @@ from jsmitsm.linear.sparse import Factor
 from jsmitsm.runtime.errors import SingularMatrix, SolveError
 from jsmitsm.runtime.jaxprs import Primitive
 from jsmitsm.runtime.tracers import is_traced
+from jsmitsm.runtime.whole_program import in_one_program
 
 __all__ = [
     "Factor",
@@ -282,6 +283,7 @@ def _without(b: Any, data: Any, rows: Any, cols: Any, x: Any) -> Any:
     return jax.vmap(_scattered, (None if b is None else 0, *axes, 0))(b, data, rows, cols, x)
 
 
+@in_one_program
 @jax.jit
 def _scattered(b: Any, data: Any, rows: Any, cols: Any, x: Any) -> Any:
     """b - A x, (n, m)."""

@@ -24,7 +24,7 @@ from jsmitsm.particle.source_fit import source_weights
 from jsmitsm.runtime import one_kernel
 from jsmitsm.runtime.compiled import at_hand
 from jsmitsm.runtime.compiler_options import on_cpu
-from jsmitsm.runtime.size_classes import BLOCK, FEW, cloud_size, padded_size
+from jsmitsm.runtime.size_classes import BLOCK, FEW, cloud_size, largest_at_hand, open_size, padded_size
 from jsmitsm.runtime.tracers import closes_over_traced, is_traced, recorded
 from jsmitsm.runtime.whole_program import COUNT, called, in_one_program, only_run
 
@@ -136,7 +136,10 @@ def _in_size_classes(function: Any) -> Any:
         loose = not (inside or is_traced(points, kernel, ids, neighbours, operands, each, whole))
         form = scheme, big, neighbours.shape[1], jac.shape[1:], one_for_all, operands.shared is None, loose
         known = compiled.setdefault(form, set())
-        size = at_hand(known, m, 2 * m, padded_size(m, 4)) if loose else at_hand(known, m, 1.25 * m, padded_size(m))
+        if loose:
+            size = at_hand(known, m, largest_at_hand(m), open_size(m))
+        else:
+            size = at_hand(known, m, 1.25 * m, padded_size(m))
         mesh = devices.of_rows(m) if loose else None
         if mesh is not None:
             size = -(-size // mesh.size) * mesh.size

@@ -26,6 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm.particle.small_systems import general_inverse
+from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.runtime.whole_program import in_one_program
 from jsmitsm.taylor.multi_indices import Slot, factorial, index_of, multi_indices
 
@@ -276,7 +277,8 @@ def source_rows(rec: Recursion, residual: Any) -> Any:
     taylor = index_of(rec.dim, rec.degree)
     e = np.array([e for e, _ in _rows(rec)])
     t = np.array([taylor[c] for _, c in _rows(rec)])
-    return _negative(residual, e, t)
+    # Under a transform it may be an array of JAX that is not traced: each operation on it is compiled by itself.
+    return _negative(residual if is_traced(residual) else np.asarray(residual), e, t)
 
 
 @in_one_program

@@ -23,6 +23,7 @@ from jsmitsm.particle.recursion import constraints
 from jsmitsm.runtime.errors import SolveError
 from jsmitsm.runtime.progress import bar
 from jsmitsm.runtime.tracers import concrete, is_traced
+from jsmitsm.runtime.whole_program import in_one_program
 from jsmitsm.solution.arguments import discretized
 from jsmitsm.solution.between import unseen
 from jsmitsm.solution.fit import Fit
@@ -117,6 +118,7 @@ def correction(fit: Fit, values: Any, made: Run | None = None) -> Correction:
     residual = _residual(high, *high_rows, high_nums, entries, values)
     trust = _trust(high, *high_rows)
     free = np.flatnonzero(~low.held.reshape(-1))
+    spread = partial(_spread, free=free, shape=low.held.shape)
     run = Run(low, fit.problem, "auto", True, False, "loo")
 
     @cache
@@ -124,12 +126,7 @@ def correction(fit: Fit, values: Any, made: Run | None = None) -> Correction:
         return all_rows(low, nums()) if made is None or made.rows is None else made.rows
 
     def defect() -> Any:
-        return _one_scale(_weights(low, *own()), _weights(high, *high_rows), low) * trust * residual
-
-    def spread(x: Any) -> Any:
-        zero = np.zeros(low.held.size)
-        every: Any = jnp.asarray(zero).at[free].set(x) if is_traced(x) else _put(zero, free, x)
-        return every.reshape(low.held.shape)
+        return _one_scale(_weights(low, *own()), _weights(high, *high_rows), low) * trust * spread(residual)
 
     def through(defects: np.ndarray, transpose: bool = False) -> np.ndarray:
         right = np.concatenate([defects.reshape(-1)[free], np.zeros(len(low.floating))])
@@ -142,7 +139,7 @@ def correction(fit: Fit, values: Any, made: Run | None = None) -> Correction:
         return through(defect), defect
 
     try:
-        x, _ = above.solved(*entries, residual.reshape(-1)[free], balanced=False)
+        x, _ = above.solved(*entries, residual, balanced=False)
     except SolveError:
         x, _ = run.solved(*matrix(low, *own()), defect().reshape(-1)[free], balanced=False)
     error = towards = spread(x)
@@ -173,15 +170,17 @@ def _one_scale(mine: Any, theirs: Any, disc: Discretization) -> Any:
 
 def _trust(disc: Discretization, classes: list[Class], rows: list[Row]) -> Any:
     """How far the rows of the higher order are trusted, (N, 1): those of one-sided stencils amplify what they miss."""
-    traced = is_traced(rows)
-    xp = jnp if traced else np
     ids = np.concatenate([cls.ids for cls in classes])
-    lebesgue = xp.concatenate([xp.asarray(row.lebesgue).max(axis=1) for row in rows])
-    part = xp.minimum(1.0, LEBESGUE / xp.maximum(lebesgue, 1.0))
-    trust = xp.ones(len(disc.cloud))
-    if traced:
-        return trust.at[ids].set(part)[:, None]
-    return _put(trust, ids, part)[:, None]
+    return _trusted([row.lebesgue for row in rows], ids, len(disc.cloud))
+
+
+@partial(in_one_program, static=("n",))
+def _trusted(lebesgue: list[Any], ids: np.ndarray, n: int) -> Any:
+    traced = is_traced(lebesgue)
+    xp: Any = jnp if traced else np
+    largest = xp.concatenate([xp.asarray(some).max(axis=1) for some in lebesgue])
+    part = xp.minimum(1.0, LEBESGUE / xp.maximum(largest, 1.0))
+    return (jnp.ones(n).at[ids].set(part) if traced else _put(np.ones(n), ids, part))[:, None]
 
 
 def _against(fit: Fit, low: Discretization, values: Any, nums: Callable[[], Numbers]) -> Correction:
@@ -339,16 +338,27 @@ def _of_order(
 
 
 def _residual(disc: Discretization, classes: Any, rows: Any, nums: Numbers, entries: Any, values: Any) -> Any:
-    """The residual b - A u of every row (N, F), by the entries of A."""
-    traced = is_traced(rows, values)
-    data, r, c = entries
+    """The residual b - A u of every row (n,), by the entries of A."""
     free = np.flatnonzero(~disc.held.reshape(-1))
-    u = (jnp if traced else np).asarray(values).reshape(-1)[free]
-    au = jnp.zeros(len(free)).at[r].add(data * u[c]) if traced else np.bincount(r, data * u[c], len(free))
-    left = right_side(disc, nums, classes, rows) - au
-    zero = np.zeros(disc.held.size)
-    every: Any = jnp.asarray(zero).at[free].set(left) if traced else _put(zero, free, left)
-    return every.reshape(disc.held.shape)
+    return _left(entries, values, right_side(disc, nums, classes, rows), free)
+
+
+@in_one_program
+def _left(entries: Any, values: Any, right: Any, free: np.ndarray) -> Any:
+    """b - A u, of the values that are ``free``."""
+    data, r, c = entries
+    xp: Any = jnp if is_traced(data, values, right) else np
+    u = xp.asarray(values).reshape(-1)[free]
+    au = jnp.zeros(u.shape).at[r].add(data * u[c]) if xp is jnp else np.bincount(r, data * u[c], len(u))
+    return right - au
+
+
+@partial(in_one_program, static=("shape",))
+def _spread(x: Any, free: np.ndarray, shape: tuple[int, int]) -> Any:
+    """Numbers at their places, zero elsewhere, (N, F)."""
+    zero = np.zeros(int(np.prod(shape)))
+    every: Any = jnp.asarray(zero).at[free].set(x) if is_traced(x) else _put(zero, free, x)
+    return every.reshape(shape)
 
 
 def _weights(disc: Discretization, classes: Any, rows: Any) -> Any:
