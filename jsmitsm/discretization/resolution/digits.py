@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from jsmitsm.cloud.cloud import Cloud
-from jsmitsm.discretization.resolution.turning import turning
+from jsmitsm.discretization.resolution.turning import USUAL, few, turning
 from jsmitsm.discretization.supports import Part
 from jsmitsm.equation.traced import Traced
 from jsmitsm.particle.recursion import Recursion
@@ -27,7 +27,7 @@ MILD, OSCILLATING, WORTH, HIGH = 0.8, 3.2, 6, 10
 
 def suited_depth(
     method: str, rec: Recursion, flat: bool, sourced: bool, traced: Traced, cloud: Cloud, params: Any,
-    part: Part | None = None,
+    held: list[np.ndarray], part: Part | None = None,
 ) -> int:  # fmt: skip
     """How many degrees the recursion should go beyond the fit.
 
@@ -40,15 +40,16 @@ def suited_depth(
     if rec.order == 2 or (rec.dim == 3 and not flat):
         return 2
     if rec.dim == 1 or (traced.constant and rec.order < WORTH) or (sourced and traced.source == "zero"):
-        return 4
-    found = turning(rec, traced, cloud, params, part)
+        return USUAL
+    found = turning(rec, traced, cloud, params, held, part)
     if found is None:
-        return 4
-    if flat or not traced.constant:  # else a few eliminations serve all, at any depth
-        if max(found.source, found.coefficients, 2.0 * found.reaction, 2.0 * found.carried) < MILD:
-            return 2
+        return USUAL
+    # Where a few eliminations serve all, depth costs next to nothing.
+    dear = not traced.constant or (flat and not few(traced, cloud, part))
+    if dear and max(found.source, found.coefficients, 2.0 * found.reaction, 2.0 * found.carried) < MILD:
+        return 2
     waves = max(found.source, found.reaction) if traced.constant and not found.carried else 0.0
-    return 6 if rec.dim == 2 and rec.order <= HIGH and waves > OSCILLATING else 4
+    return 6 if rec.dim == 2 and rec.order <= HIGH and waves > OSCILLATING else USUAL
 
 
 def room(rec: Recursion, order: int, traced: Traced, cloud: Cloud, params: Any, part: Part | None = None) -> int:
