@@ -8,6 +8,10 @@ from pathlib import Path
 if version("jaxlib").startswith("0.10."):
     os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_cpu_use_fusion_emitters=false"
 
+# Threads of a library's dense algebra wait for each other by turning, a second for each eigenvalue problem of some
+# hundred unknowns where other tests run beside.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 import jax
 import pytest
 

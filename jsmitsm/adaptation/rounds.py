@@ -109,6 +109,7 @@ class Rounds:
             done = self._done(sol, found, cloud, spacing)
             self._clocked()
             if done:
+                shown.reach(1.0)
                 return
             if number == self.max_rounds - 1:
                 self._limit(f"the {self.max_rounds} rounds that were allowed (max_rounds)")
@@ -333,21 +334,21 @@ class Rounds:
 def spent(history: dict[str, np.ndarray], tol: float) -> float:
     """The part of a search's time that is spent, about: the last two rounds tell how the error falls with particles.
 
-    Rounds to come have the last one's seconds a particle, and grow as the last one did.
+    Rounds to come have the last one's seconds a particle, and grow as the last one did; one that checks is as the last.
 
     >>> rows = {"particles": [100, 400], "error": [1e-1, 1e-2], "seconds": [1.0, 2.0]}
     >>> round(spent({name: np.array(row) for name, row in rows.items()}, 1e-3), 2)
     0.27
     """
     count, error, seconds = (history[name] for name in ("particles", "error", "seconds"))
+    gone = seconds.sum()
     if error[-1] <= tol:
-        return 1.0
+        return float(gone / (gone + seconds[-1]))
     if len(count) < 2 or not (count[-1] > count[-2] and error[-1] < error[-2] < np.inf):
         return 0.0
     growth = count[-1] / count[-2]
     more = np.log(error[-1] / tol) / np.log(error[-2] / error[-1])  # rounds to come, and parts of one
     rest = seconds[-1] * growth * (growth**more - 1.0) / (growth - 1.0)
-    gone = seconds.sum()
     return float(gone / (gone + rest))
 
 

@@ -14,14 +14,10 @@ import numpy as np
 
 from jsmitsm.cloud.packing.lattice import lattice
 from jsmitsm.cloud.packing.octree import Region, Spacing, morton, refine
-from jsmitsm.cloud.packing.relaxation import CLEARANCE, clear, relax, relax_uneven, repair
+from jsmitsm.cloud.packing.relaxation import DENSITY, settled
 from jsmitsm.runtime.errors import short
 
 SpacingLike = float | Callable[[np.ndarray], Any]
-
-# Particles per spacing^D of the densest even arrangement: hexagons in 2D; in 3D a little below the
-# 1.41 of a face-centred lattice, which relaxation from a random start does not find.
-_DENSITY = {1: 1.0, 2: 2.0 / np.sqrt(3.0), 3: 1.25}
 
 
 class Constant:
@@ -77,15 +73,8 @@ def fill(
         points = lattice(region, float(spacing(lo[None])[0]), lo, hi, boundary, rng)
         return points[np.argsort(morton(points, lo, hi), kind="stable")]
     points = _scatter(region, spacing, lo, hi, rng)
-    points = points[clear(region, points, boundary, spacing(points), 0.9 * CLEARANCE)]
-    if not len(points):
-        return points
-    points = relax(region, points, boundary, len(boundary), spacing, 8)
-    points = repair(region, points, boundary, spacing, rng)
-    points = relax(region, points, boundary, len(boundary), spacing, 4)
-    for _ in range(2):
-        points = relax_uneven(region, points, boundary, spacing, 6)
-    points = points[clear(region, points, boundary, spacing(points), 0.8 * CLEARANCE)]
+    directions = lambda around, count: rng.normal(size=(count * len(around), len(lo)))  # noqa: E731
+    points = settled(region, points, boundary, spacing, directions)
     return points[np.argsort(morton(points, lo, hi), kind="stable")]
 
 
@@ -122,12 +111,12 @@ def _scatter(
 ) -> np.ndarray:
     """A start of the right density: octree cells of at most one particle each, dithered along a Morton curve."""
     dim = len(lo)
-    fraction = _DENSITY[dim] ** (-1.0 / dim)
+    fraction = DENSITY[dim] ** (-1.0 / dim)
     shift = rng.uniform(0.0, 0.5, dim) * float((hi - lo).max()) / 100
     cells, _ = refine(region, spacing, lo - shift, hi + shift, fraction, True)
     order = np.argsort(morton(cells.centers, lo, hi), kind="stable")
     width = cells.widths[order]
-    expected = np.cumsum(_DENSITY[dim] * (width / cells.spacing[order]) ** dim) * (1 - 1e-9)
+    expected = np.cumsum(DENSITY[dim] * (width / cells.spacing[order]) ** dim) * (1 - 1e-9)
     chosen = np.diff(np.floor(expected + rng.uniform()), prepend=0.0) > 0
     jitter = rng.uniform(-0.45, 0.45, (len(expected), dim)) * width[:, None]
     points = (cells.centers[order] + jitter)[chosen]

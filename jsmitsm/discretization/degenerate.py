@@ -15,6 +15,7 @@ import jax
 import numpy as np
 
 from jsmitsm.discretization.layout import Discretization, mean_spacing, split
+from jsmitsm.discretization.parts.whole import ALONE, Whole
 from jsmitsm.equation.problem import Problem
 from jsmitsm.particle.recursion import Recursion, constraints, fit_and_tail, row_lifts
 from jsmitsm.runtime.tracers import any_number, concrete
@@ -55,8 +56,11 @@ class _Found:
     slack: float
 
 
-def candidates(disc: Discretization, jac: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Those of the particles (n,) of jac (E, S, T, n) whose leading coefficients are near zero, and how near."""
+def candidates(disc: Discretization, jac: np.ndarray, told: Whole = ALONE) -> tuple[np.ndarray, np.ndarray]:
+    """Those of the particles (n,) of jac (E, S, T, n) whose leading coefficients are near zero, and how near.
+
+    told: what tells of the jac of all processes, where these ask together.
+    """
     rec, length = disc.rec, 2.0 * mean_spacing(disc)
     degree = [sum(t) for t in index_of(rec.dim, rec.degree)]
     least = np.full(jac.shape[-1], np.inf)
@@ -66,11 +70,11 @@ def candidates(disc: Discretization, jac: np.ndarray) -> tuple[np.ndarray, np.nd
         near = [t for t, d in enumerate(degree[: jac.shape[2]]) if d <= 2]
         every = np.max([np.abs(jac[e, s, t]) * length ** (p + degree[t]) for s, p in enumerate(powers) for t in near],
                        axis=0)  # fmt: skip
-        usual = np.quantile(lead, MOST)
+        usual = told.quantile(lead, MOST)
         every = np.minimum(every, usual) if usual > 0 else every
         least = np.minimum(least, np.where(every > 0, lead / np.where(every > 0, every, 1.0), 0.0))
     few = np.flatnonzero(least <= LEADING)
-    few = few if len(few) <= MANY else np.flatnonzero(least <= TINY)
+    few = few if told.total(len(few)) <= MANY else np.flatnonzero(least <= TINY)
     return few, least[few]
 
 

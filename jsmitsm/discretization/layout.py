@@ -13,9 +13,10 @@ from jsmitsm.cloud.cloud import Cloud, kept
 from jsmitsm.cloud.neighbours import Stencils
 from jsmitsm.cloud.regions.region_cloud import RegionCloud
 from jsmitsm.cloud.walls import Walls, seen
+from jsmitsm.discretization.parts.whole import Part
 from jsmitsm.discretization.periodic import Images, periodic_images, with_corners
-from jsmitsm.discretization.resolution.digits import room, suited_depth
-from jsmitsm.discretization.supports import Part, check_supports, cut_off, default_kernel, find_stencils, walls_of
+from jsmitsm.discretization.resolution.digits import room, suited_depth, warn_of_float32
+from jsmitsm.discretization.supports import check_supports, cut_off, default_kernel, find_stencils, walls_of
 from jsmitsm.equation.branches import FIELD
 from jsmitsm.equation.closing import closed
 from jsmitsm.equation.conditions import Group, group_conditions
@@ -32,8 +33,7 @@ from jsmitsm.runtime.compiled import at_hand
 from jsmitsm.runtime.errors import IN_FUNCTIONS, in_words
 from jsmitsm.runtime.tracers import concrete, is_traced, owned
 
-# Bytes of the user's stencils that are quickly compared.
-_LARGE = 1 << 22
+_LARGE = 1 << 22  # bytes of the user's stencils that are quickly compared
 
 
 @dataclass
@@ -120,6 +120,7 @@ def discretize(
     if isinstance(cloud, RegionCloud) or isinstance(problem.pde, PerRegion):
         raise ValueError("problem: several regions are for js.solve, js.factorize, js.evolve, js.eigen; not for this")
     refuse_extras(problem)
+    warn_of_float32(cloud)
     kernel = kernel and kernel.recorded()
     traced = _traced(problem, cloud.dim)
     _check_operator(traced, problem, order)
@@ -143,9 +144,7 @@ def discretize(
     if method == "SSPH":
         _check_collocated(groups, problem.fields)
     if kernel is not None and not is_traced(kernel) and np.shape(kernel.h) not in ((), (len(cloud),)):
-        raise ValueError(
-            f"kernel: h has shape {np.shape(kernel.h)}, expected a scalar or one per particle, ({len(cloud)},)"
-        )
+        raise ValueError(f"kernel: h has shape {np.shape(kernel.h)}, expected a number or ({len(cloud)},), one each")
     if isinstance(kernel, Constant) and method in ("II", "III"):
         raise ValueError(
             f"kernel: the derivatives of js.Constant vanish, and method {method} tests with them; use another kernel"

@@ -8,6 +8,7 @@ import numpy as np
 
 from jsmitsm.discretization.coefficients import Numbers
 from jsmitsm.discretization.layout import Discretization, mean_spacing
+from jsmitsm.discretization.parts.whole import particles, whole
 from jsmitsm.particle.recursion import Recursion
 from jsmitsm.runtime.tracers import concrete, is_traced
 
@@ -48,17 +49,14 @@ def information_travels(disc: Discretization, coefficients: Any, most: float = 2
         return False
     values = _diffusivities(rec, jac)
     diffusion = np.abs(values).max(axis=1)
-    if _all_told(disc, (values[:, 0] * values[:, -1] < -1e-10 * diffusion**2).any()).any():
+    if whole(disc).total(int((values[:, 0] * values[:, -1] < -1e-10 * diffusion**2).any())):
         return True
     drift = [s for s, (_, b) in enumerate(rec.slots) if sum(b) == 1]
     if not drift or concrete(disc.cloud.points) is None:
         return False
     speed = np.linalg.norm(jac[0, drift, 0], axis=0)
     convective = speed * mean_spacing(disc) / np.where(diffusion > 0, diffusion, np.inf)
-    if disc.part is None:
-        return bool(np.median(convective) > most)
-    above, below = _all_told(disc, (convective > most).sum(), (convective <= most).sum())
-    return bool(above > below)
+    return whole(disc).quantile(convective, 0.5) > most
 
 
 def _diffusivities(rec: Recursion, jac: np.ndarray) -> np.ndarray:
@@ -77,21 +75,16 @@ def turned(disc: Discretization, nums: Numbers) -> np.ndarray:
 
     In between they have no weight, and what holds of the solution on one side need not on the other.
     """
-    rec, jac = disc.rec, np.asarray(nums.jac)
-    if rec.fields > 1 or jac.shape[-1] == 1 or rec.dim > 1 and set(rec.orders) != {2}:
+    rec, told = disc.rec, whole(disc)
+    jac, ids = (told.owned(nums.ids, np.asarray(x)) for x in (nums.jac, nums.ids))
+    if rec.fields > 1 or np.shape(nums.jac)[-1] == 1 or rec.dim > 1 and set(rec.orders) != {2}:
         return np.zeros(0, int)
     if rec.dim == 1:
         values = jac[0, [s for s, (_, b) in enumerate(rec.slots) if sum(b) == max(rec.orders)], 0].T
     else:
         values = _diffusivities(rec, jac)
-    above, below = nums.ids[(values > 0).all(axis=1)], nums.ids[(values < 0).all(axis=1)]
-    return min(above, below, key=len)
-
-
-def _all_told(disc: Discretization, *counts: Any) -> np.ndarray:
-    """Counts over the whole cloud."""
-    mine = np.array(counts, int)
-    return mine if disc.part is None else disc.part.total(mine)
+    above, below = ids[(values > 0).all(axis=1)], ids[(values < 0).all(axis=1)]
+    return min(above, below, key=lambda some: told.total(len(some)))
 
 
 def _timelike(rec: Recursion) -> bool:
@@ -109,15 +102,15 @@ def cell_peclet(disc: Discretization, nums: Numbers) -> float:
     orders = set(rec.orders)
     if rec.fields > 1 or orders != {2} or not drift or not second or is_traced(nums.jac, disc.cloud.points):
         return 0.0
-    jac = np.asarray(nums.jac)[0, :, 0]
+    jac = whole(disc).owned(nums.ids, np.asarray(nums.jac)[0, :, 0])
     speed, diffusion = np.linalg.norm(jac[drift], axis=0), np.abs(jac[second]).max(axis=0)
-    return float(np.median(speed * mean_spacing(disc) / np.where(diffusion > 0, diffusion, np.inf)))
+    return whole(disc).quantile(speed * mean_spacing(disc) / np.where(diffusion > 0, diffusion, np.inf), 0.5)
 
 
 def usual_condition(disc: Discretization) -> float:
     """Of the order of the condition of a regular system: n^(m/D) for an operator of order m, times the contrast of
     conductivities where there are several regions; squared where one of these takes the least-squares form."""
-    usual = float(len(disc.cloud) ** (max(disc.rec.orders) / disc.rec.dim)) * getattr(disc, "contrast", 1.0)
+    usual = float(particles(disc) ** (max(disc.rec.orders) / disc.rec.dim)) * getattr(disc, "contrast", 1.0)
     return usual**2 if getattr(disc, "squared", False) else usual
 
 
@@ -129,10 +122,11 @@ def wave_number(disc: Discretization, nums: Numbers) -> float:
     orders = set(rec.orders)
     if rec.fields > 1 or orders != {2} or not zero or not pure or is_traced(nums.jac, disc.cloud.points):
         return 0.0
-    jac = np.asarray(nums.jac)[0, :, 0]
+    jac = whole(disc).owned(nums.ids, np.asarray(nums.jac)[0, :, 0])
     second = jac[pure]
     # A wave equation in space and time has second derivatives of both signs: another matter.
-    if (second.min(axis=0) * second.max(axis=0) <= 0).any():
+    if whole(disc).total(int((second.min(axis=0) * second.max(axis=0) <= 0).any())):
         return 0.0
-    square = np.median(jac[zero[0]] / second[np.argmax(np.abs(second), axis=0), np.arange(second.shape[1])])
+    square = jac[zero[0]] / second[np.argmax(np.abs(second), axis=0), np.arange(second.shape[1])]
+    square = whole(disc).quantile(square, 0.5)
     return float(np.sqrt(max(square, 0.0)))

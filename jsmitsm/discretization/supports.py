@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import jax.numpy as jnp
@@ -12,6 +10,7 @@ import numpy as np
 from jsmitsm.cloud.cloud import INTERIOR, Cloud
 from jsmitsm.cloud.neighbours import Stencils, evenly_spaced, in_line, jumps, replaced, within
 from jsmitsm.cloud.walls import Walls, nearest_seen, within_seen
+from jsmitsm.discretization.parts.whole import Part
 from jsmitsm.discretization.periodic import Images
 from jsmitsm.equation.problem import Problem
 from jsmitsm.particle.elimination import Scheme
@@ -23,23 +22,6 @@ from jsmitsm.runtime.tracers import concrete, is_traced
 _EVEN_RATIO = {4: 1.5, 5: 1.5, 6: 1.5, 7: 1.65, 8: 1.65, 9: 1.8, 10: 1.8, 11: 1.8, 12: 1.8}
 # Particles whose given stencils are compared with their supports, at the most.
 _LOOKED_AT = 500
-
-
-@dataclass(frozen=True)
-class Part:
-    """A part of a cloud that several processes share: what is decided of the whole, and how they decide together.
-
-    own (n,) bool: the particles whose rows are made here, the others are only looked at. even: whether the whole cloud
-    is evenly spaced; spacing: the mean one of the whole; sample (m, D): some of its particles. largest: of numbers by
-    name the largest of all parts; total: the sum of an array over all parts; both are called by all of them at once.
-    """
-
-    own: np.ndarray
-    even: bool
-    spacing: float
-    sample: np.ndarray
-    largest: Callable[[dict[Any, int]], dict[Any, int]]
-    total: Callable[[np.ndarray], np.ndarray]
 
 
 def scheme_size(scheme: Scheme) -> int:

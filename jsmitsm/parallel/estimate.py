@@ -4,26 +4,21 @@ from __future__ import annotations
 
 import numpy as np
 
-from jsmitsm.discretization.resolution.digits import room
-from jsmitsm.parallel.assembly import assembled
-from jsmitsm.parallel.local import Local, Settings
 from jsmitsm.parallel.pencil.modes import ParallelModes, errors
 from jsmitsm.parallel.solution import ParallelSolution
 from jsmitsm.runtime.errors import explaining
-from jsmitsm.solution.estimate import compared
-from jsmitsm.taylor.multi_indices import HIGHEST
 
 
 @explaining
 def error_estimate(sol: ParallelSolution | ParallelModes) -> np.ndarray:
     """Estimated error |u - u_exact| at the own particles, or of eigenvalues; see ``js.Solution.error_estimate``.
 
-    That towards one other order: no second one is asked.
+    As there what leads to the solution by method S of order p + 2, or to that of a lower order where this knows more.
 
     Parameters
     ----------
     sol : ParallelSolution or ParallelModes
-        Of method S; or what ``jp.eigen`` found, whose values are found once more by order p + 2.
+        What ``jp.solve`` found; or ``jp.eigen``, whose values are found once more by order p + 2.
 
     Returns
     -------
@@ -34,7 +29,9 @@ def error_estimate(sol: ParallelSolution | ParallelModes) -> np.ndarray:
     Raises
     ------
     ValueError
-        For method III, and where order + 2 is beyond the highest.
+        Where order + 2 is beyond the highest.
+    SolveError
+        Where the system of the other order is not solved.
 
     Examples
     --------
@@ -42,25 +39,5 @@ def error_estimate(sol: ParallelSolution | ParallelModes) -> np.ndarray:
     """
     if isinstance(sol, ParallelModes):
         return errors(sol)
-    us, low = sol._team, sol._local
-    order = sol._recipe.order + 2  # the highest that may be asked for
-    with us.phase():
-        if sol._recipe.method != "S":
-            raise ValueError("error_estimate: made for method S alone on several processes; use js.solve")
-        if not low.disc.linear:
-            raise ValueError("error_estimate: made for linear problems alone on several processes; use js.solve")
-        if order > HIGHEST:
-            raise ValueError(f"error_estimate: needs expansions of order {order}, and {HIGHEST} is the highest")
-    with us.phase():
-        disc = low.disc
-        room_at = lambda order: room(disc.rec, order, disc.traced, low.cloud, disc.problem.params, low.part)
-        order = compared(disc.rec.order, disc.rec.depth, room_at(order), max(disc.rec.orders))
-        most = room_at(order)
-    high = Local(us, low.problem, low.mine, Settings("S", order, min(disc.rec.depth, most), None, True, "loo"))
-    system, right = assembled(us, high, "auto")
-    values = sol._values[low.halo.ids]
-    free = ~high.disc.held[high.halo.ids]
-    x = system.solve(right - system.times(values[free]))
-    out = np.zeros(values.shape)
-    out[free] = np.abs(x)
-    return out[:, 0] if sol._recipe.fields == 1 else out
+    error = np.abs(sol._corrected())
+    return error[:, 0] if sol._recipe.fields == 1 else error

@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from jsmitsm.cloud import contour, filling, levelset, surface
 from jsmitsm.cloud.cloud import INTERIOR
+from jsmitsm.cloud.packing.graded import Blocks, blocks, graded_part, owners
 from jsmitsm.cloud.packing.lattice import lattice_part
 from jsmitsm.cloud.packing.octree import morton
 from jsmitsm.cloud.shapes import checked_bounds, checked_seed, from_sdf, grouped, own_normals
 from jsmitsm.parallel.distributed import ParallelCloud, Slab, placed, slab_of
 from jsmitsm.parallel.team import Team, team
 from jsmitsm.runtime.errors import explaining, short
+
+# A graded shape of fewer particles is made whole by the first process: each part would start from all of them.
+WHOLE = 20_000
 
 
 @explaining
@@ -25,19 +29,19 @@ def cloud_from(make: Callable[..., Any], *arguments: Any, **options: Any) -> Par
     Parameters
     ----------
     make : function
-        ``js.from_sdf``, in 2D or 3D and with one spacing everywhere, is filled in parts. All else that returns a cloud
-        is made whole by the first process: spacings that vary, where particles repel each other everywhere, polygons,
-        lattices.
+        ``js.from_sdf``, in 2D or 3D, is filled in parts; where the spacing varies from some 20,000 particles on. All
+        else that returns a cloud is made whole by the first process: polygons, lattices.
     *arguments, **options
         Its own, as in sdf, bounds, spacing, seed, groups.
 
     Returns
     -------
     ParallelCloud
-        The slab of this process. Filled in parts the boundary is that of ``make``. The interior is the same lattice,
-        with another disorder: one that hangs on the place alone, so that any number of processes fills a shape with the
-        same particles. Every process finds the whole boundary, and no more of the interior than its slab. What the
-        first process makes is the cloud of ``make``; it alone holds the whole of it, and only until it is dealt out.
+        What this process has of it. Filled in parts the boundary is that of ``make``. The interior is the same lattice,
+        or relaxed as often, with another disorder: one that hangs on the place alone, so that any number of processes
+        fills a shape with the same particles. Every process finds the whole boundary, and of the interior its part and
+        what is carried into it, over 31 spacings. What the first process makes is the cloud of ``make``; it alone holds
+        the whole of it, and only until it is dealt out.
 
     Raises
     ------
@@ -56,11 +60,34 @@ def cloud_from(make: Callable[..., Any], *arguments: Any, **options: Any) -> Par
         if make is from_sdf:
             given = inspect.signature(from_sdf).bind(*arguments, **options)
             given.apply_defaults()
-    if given is None or callable(given.arguments["spacing"]):
-        return ParallelCloud(placed(us, _dealt(us, lambda: make(*arguments, **options))))
-    with us.phase():
-        slab = _filled(us, **given.arguments)
-    return ParallelCloud(_numbered(us, *slab))
+    if given is not None:
+        with us.phase():
+            shape = _shape(given.arguments)
+        if shape.grid is None or shape.grid.share.sum() >= WHOLE:
+            with us.phase():
+                parts = _filled(us, shape, given.arguments["groups"])
+            return ParallelCloud(_numbered(us, *parts))
+    return ParallelCloud(placed(us, _dealt(us, lambda: make(*arguments, **options))))
+
+
+class _Shape(NamedTuple):
+    """What ``js.from_sdf`` was asked for; grid: of a spacing that varies, the blocks that are dealt out."""
+
+    region: levelset.SdfRegion
+    rule: Any
+    lo: np.ndarray
+    hi: np.ndarray
+    seed: int
+    grid: Blocks | None
+
+
+def _shape(given: Mapping[str, Any]) -> _Shape:
+    lo, hi = checked_bounds(given["bounds"])
+    if len(lo) == 1:
+        raise ValueError("bounds: a shape in 1D has no need of several processes; use js.from_sdf")
+    rule, seed = filling.spacing_function(given["spacing"]), checked_seed(given["seed"])
+    region = levelset.SdfRegion(given["sdf"], lo, hi)
+    return _Shape(region, rule, lo, hi, seed, blocks(region, rule, lo, hi) if callable(given["spacing"]) else None)
 
 
 def _dealt(us: Team, make: Callable[[], Any]) -> Slab:
@@ -76,25 +103,26 @@ def _dealt(us: Team, make: Callable[[], Any]) -> Slab:
 
 
 def _filled(
-    us: Team, sdf: Any, bounds: Any, spacing: Any, seed: Any, groups: Mapping[str, Any] | None
+    us: Team, shape: _Shape, groups: Mapping[str, Any] | None
 ) -> tuple[np.ndarray, levelset.Boundary, dict[str, np.ndarray], np.ndarray]:
-    """The own interior particles, the whole boundary with its groups, and the slab's ends."""
-    lo, hi = checked_bounds(bounds)
-    if len(lo) == 1:
-        raise ValueError("bounds: a shape in 1D has no need of several processes; use js.from_sdf")
-    rule, seed = filling.spacing_function(spacing), checked_seed(seed)
-    region = levelset.SdfRegion(sdf, lo, hi)
+    """The own interior particles, the whole boundary with its groups, and which of it is this process's."""
+    region, rule, lo, hi, seed, grid = shape
     boundary = surface.surface(region, rule, seed) if len(lo) == 3 else contour.contour(region, rule)
     boundary = levelset.checked(region, boundary)
     named = grouped(boundary.points, groups) if groups is not None else {"boundary": np.arange(len(boundary.points))}
-    axis = int(np.argmax(hi - lo))
-    ends = lo[axis] + (hi[axis] - lo[axis]) * np.arange(us.size + 1) / us.size
-    ends[0], ends[-1] = -np.inf, np.inf
-    inside = lattice_part(region, float(spacing), lo, hi, boundary.points, seed, axis, ends[us.rank : us.rank + 2])
+    if grid is None:
+        axis = int(np.argmax(hi - lo))
+        ends = lo[axis] + (hi[axis] - lo[axis]) * np.arange(us.size + 1) / us.size
+        ends[0], ends[-1] = -np.inf, np.inf
+        low, high = ends[us.rank : us.rank + 2]
+        inside = lattice_part(region, rule.value, lo, hi, boundary.points, seed, axis, np.array([low, high]))
+        here = (boundary.points[:, axis] >= low) & (boundary.points[:, axis] < high)
+    else:
+        mine = owners(grid, us.size) == us.rank
+        inside = graded_part(region, rule, lo, hi, boundary.points, seed, grid, mine)
+        here = mine[grid.at(boundary.points)]
     inside = inside[np.argsort(morton(inside, lo, hi), kind="stable")]
-    boundary = levelset.Boundary(boundary.points, own_normals(region, rule, boundary, named))
-    here = (boundary.points[:, axis] >= ends[us.rank]) & (boundary.points[:, axis] < ends[us.rank + 1])
-    return inside, boundary, named, here
+    return inside, levelset.Boundary(boundary.points, own_normals(region, rule, boundary, named)), named, here
 
 
 def _numbered(

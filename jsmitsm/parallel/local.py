@@ -19,9 +19,9 @@ from jsmitsm.discretization.coefficients import Numbers, numbers, slot_series
 from jsmitsm.discretization.held_particles import with_held_expansions
 from jsmitsm.discretization.layout import Class, Discretization, discretize, sorted_classes, table
 from jsmitsm.discretization.operator_kind import information_travels
+from jsmitsm.discretization.parts.whole import Part, Whole
 from jsmitsm.discretization.resolution.digits import LOOKED_AT
 from jsmitsm.discretization.rows import all_coefficients, all_rows
-from jsmitsm.discretization.supports import Part
 from jsmitsm.equation.conditions import refuse_counts
 from jsmitsm.equation.problem import Problem
 from jsmitsm.parallel.distributed import Slab
@@ -79,7 +79,8 @@ class Local:
         halo, s = self.halo, self.settings
         with self.team.phase(halo.slab.number):
             even = self._even()
-            self.part = Part(halo.own, even, self._spacing(), self._sample(), self.team.largest, self.team.total)
+            self.part = Part(halo.own, even, self._spacing(), self._sample(), halo.slab.number, self.mine.count,
+                             self.team.largest, self.team.total, self.team.gather)  # fmt: skip
             cloud = halo.slab.cloud()
             kernel = s.kernel and local_kernel(s.kernel, halo.slab)
             local = self._localised(halo.slab, cloud)
@@ -164,6 +165,11 @@ class Local:
                 "method: III eliminates other coefficients in other parts of this cloud, where the equation's leading "
                 'coefficients differ; use method="S"'
             )
+
+    @property
+    def whole(self) -> Whole:
+        """What is told of all particles."""
+        return Whole(self.part)
 
     # -- unknowns
 

@@ -8,12 +8,16 @@ import numpy as np
 
 from jsmitsm.parallel.halo import from_box
 from jsmitsm.parallel.local import OfOwn
+from jsmitsm.parallel.look.flags import told
+from jsmitsm.parallel.look.towards import corrected
 from jsmitsm.parallel.team import Team, team
 from jsmitsm.runtime.arrays import ArrayLike
-from jsmitsm.runtime.errors import explaining
+from jsmitsm.runtime.errors import SolveError, explained, explaining
 from jsmitsm.runtime.tracers import frozen
 from jsmitsm.solution.evaluation import checked_points
 from jsmitsm.solution.fit import Recipe
+from jsmitsm.solution.flags import too_large
+from jsmitsm.solution.look.sizes import share
 from jsmitsm.solution.solution import Solution
 
 
@@ -30,6 +34,8 @@ class ParallelSolution(OfOwn):
         Their numbers in the whole cloud.
     local : Solution
         A solution on the own particles and those around them, with all that a ``js.Solution`` can do there.
+    flags : list of str
+        What speaks against the solution; see ``js.Solution``.
     iterations : int
         Steps of Newton's method; 1 for a linear problem.
     stats : dict
@@ -42,6 +48,9 @@ class ParallelSolution(OfOwn):
         self._values, self._recipe = values, recipe
         self._taylor: Any = None
         self._linearised: Any = None  # the expansions at which a nonlinear problem was linearised last
+        self._error: np.ndarray | None = None  # the estimate (n, F), once asked for
+        self._share = 0.0  # of the solution
+        self._found: list[str] | None = None
         self.iterations = 1
         halo, health = local.halo, local.run.health
         sent = sum(len(at) for at in halo.lent)
@@ -69,6 +78,29 @@ class ParallelSolution(OfOwn):
         return Solution(
             self._values, self._local.cloud, self._recipe, None, True, 1, dict(self.stats), fitted=frozen(self._taylor)
         )
+
+    @property
+    def flags(self) -> list[str]:
+        """The sentences of one process, the same on all, which ask together; tested when first asked for."""
+        if self._found is None:
+            self._found = told(self._local, self.system, self._values, self._linearised, self._estimated)
+        return explained([*self._found, *too_large(self._share)])
+
+    def _corrected(self) -> np.ndarray:
+        """The estimated error (n, F) of the own values, with its sign."""
+        if self._error is None:
+            self._error, units = corrected(self._local, self._values, self._linearised)
+            own = self._values[self._local.halo.ids]
+            self._share = share(self._error * units, own * units, told=self._local.whole)
+        return self._error
+
+    def _estimated(self) -> float:
+        """Over the solution, infinite where there is no estimate."""
+        try:
+            self._corrected()
+        except (ValueError, SolveError):
+            return np.inf
+        return self._share if np.isfinite(self._share) else np.inf
 
     def gathered(self) -> np.ndarray | None:
         """Values (N,) or (N, F) of the whole cloud in its order, on the first process; None on the others."""

@@ -99,18 +99,25 @@ class System:
 
     def solve(self, b: np.ndarray, transpose: bool = False) -> np.ndarray:
         """The own part (n,) of the solution of A x = b, or of A^T x = b."""
-        matrix = self.matrix
+        x, found = self.answer(b, transpose, ROUND_OFF)
+        self.info.update(found | {"tried": self.info["tried"] + found.get("tried", [])})
+        return x
+
+    def answer(
+        self, b: np.ndarray, transpose: bool, enough: float, within: float = BACKWARD_ERROR
+    ) -> tuple[np.ndarray, dict[str, Any]]:  # fmt: skip
+        """The same, and what was done: corrected until a backward error is enough, accepted within another."""
+        matrix, tried = self.matrix, []
         if transpose:
             self.turned = matrix = self.turned or self.matrix.transpose(self.petsc.Mat())
         if not self.team.most(float(np.abs(b).max(initial=0.0))):
-            return np.zeros(self.n)
+            return np.zeros(self.n), {}
         for way in self.ways:
-            x, error, steps = self._refined(way, matrix, b, transpose)
+            x, error, steps = self._refined(way, matrix, b, transpose, enough)
             first = steps[0] if steps else 0
-            self.info.update({"solver": way, "iterations": first, "in_all": sum(steps), "residual": error})
-            self.info["tried"].append((way, first, error))
-            if error <= BACKWARD_ERROR:
-                return x
+            tried.append((way, first, error))
+            if error <= within:
+                return x, {"solver": way, "iterations": first, "in_all": sum(steps), "residual": error, "tried": tried}
         raise SolveError(
             f"{' and '.join(self.ways)} left a backward error of {error:.1e} of the global system, which is singular "
             "or beyond this solver; is a condition missing, or the operator at a resonance? Try solver=\"mumps\""
@@ -120,7 +127,9 @@ class System:
         """The own part (n,) of A x."""
         return product(self.matrix, x)
 
-    def _refined(self, way: str, matrix: Any, b: np.ndarray, transpose: bool) -> tuple[np.ndarray, float, list[int]]:
+    def _refined(
+        self, way: str, matrix: Any, b: np.ndarray, transpose: bool, enough: float
+    ) -> tuple[np.ndarray, float, list[int]]:  # fmt: skip
         """The solution of one solver, its backward error, and the iterations of the first solve and each correction."""
         right, x, step, residual = (matrix.createVecLeft() for _ in range(4))
         right.setArray(b)
@@ -144,7 +153,7 @@ class System:
                         best, kept = error, x.getArray().copy()
                     break
                 best, kept = error, x.getArray().copy()
-                if best <= ROUND_OFF:
+                if best <= enough:
                     break
         except self.petsc.Error:
             pass

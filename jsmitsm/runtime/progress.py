@@ -6,8 +6,9 @@ environment variable ``TQDM_DISABLE=1``.
 
 There is one bar at a time: what opens a bar inside of another's becomes a stage that the outer one
 names, "solve, local fits 40%", and "compiling (first call)" while that is what takes the time. What is left of the
-whole call is told where its parts are known, else what is left of the stage. A clock ticks beside it, also while one
-long call (a factorisation, a compilation) reports nothing.
+whole call is told where its parts are known, else what is left of the stage: of what has begun by the time that it
+took so far, of what has not by its share. A clock ticks beside it, also while one long call (a factorisation, a
+compilation) reports nothing.
 
 tqdm draws. rich would bring the clock (ten lines here), but takes 0.15 s to import, and ipywidgets in notebooks.
 """
@@ -28,6 +29,8 @@ from typing import Any
 DELAY, TICK, PAUSE = 1.5, 0.5, 0.1
 # A stage that has lasted so many seconds tells how many are left.
 LASTING = 2.0
+# What reports nothing moves a bar by the clock alone, no further than this.
+NEARLY = 0.95
 COMPILING = "compiling (first call)"
 _COMPILERS = ("jax/_src/compiler.py", "jax/_src/interpreters/mlir.py")
 # The parts of a call in their order: a word in the name of each stage, and its share of the time, about.
@@ -64,6 +67,7 @@ class _Bar:
                          leave=False, bar_format=form, smoothing=0.0 if parts else 0.3)  # fmt: skip
         self._lock, self._done = threading.Lock(), threading.Event()
         self._said, self._noted, self._caller = "", "", threading.get_ident()
+        self._foretold = 0.0  # seconds of the whole call
         self._clock = threading.Thread(target=self._tick, name=f"clock of {what}", daemon=True)
         self._clock.start()
 
@@ -78,6 +82,8 @@ class _Bar:
                 self._bar.set_postfix_str(COMPILING if busy else self._noted, refresh=False)
             else:
                 self._describe(COMPILING if busy and COMPILING not in self._said else "")
+            if self._foretold:
+                self._bar.n = max(self._bar.n, min(self.elapsed() / self._foretold, NEARLY))
             self._bar.update(0)
 
     def _describe(self, more: str = "") -> None:
@@ -101,9 +107,13 @@ class _Bar:
             self._bar.update(0)
 
     def reach(self, part: float) -> None:
-        """Say which part of the whole call is done."""
+        """Say which part of the time of the whole call is over."""
         with self._lock:
-            self._bar.n = max(self._bar.n, min(part, 1.0))
+            self._foretold = self.elapsed() / part if part > 0.0 else 0.0
+            self._bar.n = min(part, 1.0)
+
+    def elapsed(self) -> float:
+        return float(self._bar.format_dict["elapsed"])
 
     def stage(self, what: str, total: int | None) -> Any:
         if self.total:
@@ -133,7 +143,10 @@ class _Stage:
         self.done += n
         if self.share:
             first, last = self.share
-            self.outer.reach(first + (last - first) * (self.done / self.total if self.total else 0.0))
+            part = self.done / self.total if self.total else 0.0
+            gone, here = self.outer.elapsed(), time.monotonic() - self.start
+            # Until the end of this stage it is as long as its part says, then as long as shares say.
+            self.outer.reach(last * gone / (gone + here * (1.0 / part - 1.0)) if part and gone else first)
         self.say("")
 
     def note(self, text: str) -> None: ...

@@ -12,7 +12,7 @@ from jsmitsm.discretization.coefficients import Numbers
 from jsmitsm.discretization.layout import Discretization
 from jsmitsm.discretization.least_squares import misfit
 from jsmitsm.runtime.tracers import is_traced
-from jsmitsm.solution.flags import scales
+from jsmitsm.solution.look.sizes import scales
 from jsmitsm.taylor.multi_indices import HIGHEST
 
 # A solvable pure Neumann problem leaves a mean residual below this part of its data,

@@ -25,9 +25,9 @@ from jsmitsm.runtime.progress import bar
 from jsmitsm.runtime.tracers import concrete, is_traced
 from jsmitsm.runtime.whole_program import in_one_program
 from jsmitsm.solution.arguments import discretized
-from jsmitsm.solution.between import unseen
 from jsmitsm.solution.fit import Fit
-from jsmitsm.solution.flags import share
+from jsmitsm.solution.look.between import unseen
+from jsmitsm.solution.look.sizes import share
 from jsmitsm.solution.run import Run
 from jsmitsm.taylor.multi_indices import HIGHEST, multi_indices
 

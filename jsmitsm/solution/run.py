@@ -71,6 +71,10 @@ class Run:
         """The expansions (N, F, K) that belong to values (N, F), those of held particles too."""
         return with_held_expansions(self.disc, all_coefficients(self.disc, nums, values))
 
+    def fitted(self, nums: Any, values: Any) -> np.ndarray:
+        """The polynomials (N, F, K) of a solution (N, F) at the particles that carry equations."""
+        return np.asarray(all_coefficients(self.disc, nums, values), float)
+
     def operators(self) -> list[tuple[Discretization, Any, np.ndarray]]:
         """The discretisation of each equation, its numbers, and the particles (of all) where it holds."""
         return [(self.disc, self.nums, np.arange(len(self.disc.cloud)))]
@@ -98,7 +102,7 @@ class Run:
             self._tell_repairs()
         assert self.health is not None
         bad = self.health.undetermined
-        if len(bad) and not self._finite(nums):
+        if len(bad) and not np.isfinite(np.asarray(nums.jac)).all():
             self.fail(
                 f"the equation or its derivative by u is not finite at {len(bad)} particle(s), first {some(bad)}: "
                 "start nearer to the solution (u0), inside the range for which the pde is defined",
@@ -113,9 +117,6 @@ class Run:
                 + "widen the support (h, d or stencils), lower the order, or move the particles",
                 bad,
             )
-
-    def _finite(self, nums: Any) -> bool:
-        return bool(np.isfinite(np.asarray(nums.jac)).all())
 
     def _tell_repairs(self) -> None:
         found = self.health

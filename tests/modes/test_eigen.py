@@ -118,14 +118,13 @@ def test_a_plate_buckles():
 
 
 def test_gradients_through_an_operator_as_the_mass():
-    column = js.Problem(
-        lambda u, x, a: (1 + a * x[0]) * js.partial(u, (4,))(x), {"left": CLAMPED, "right": CLAMPED}, params=0.3
-    )
-    rod = js.interval(0.0, 1.0, 21)
+    ends = dict.fromkeys(("left", "right"), js.dirichlet(0.0))
+    column = js.Problem(lambda u, x, a: -(1 + a * x[0]) * js.laplacian(u)(x), ends, params=0.3)
+    rod = js.interval(0.0, 1.0, 15)
 
     def load(a):
-        mass = lambda u, x, a: -(1 + a * x[0] ** 2) * js.laplacian(u)(x)  # noqa: E731
-        return js.eigen(column.replace(params=a), rod, 1, order=4, mass=mass).values[0]
+        mass = lambda u, x, a: u(x) + a * x[0] * js.grad(u)(x)[0]  # noqa: E731
+        return js.eigen(column.replace(params=a), rod, 1, order=2, mass=mass).values[0]
 
     slope = difference(load, 0.3)
     assert abs(jax.grad(load)(0.3) - slope) < 1e-6 * abs(slope)
@@ -157,7 +156,6 @@ def test_an_elastic_square_between_rollers(lattice):
     modes = js.eigen(js.Problem(operator, bcs, fields=2), lattice, 3, mass=(2.0, 2.0), order=4)
     exact = np.sort([mu * 2, lame + 2 * mu, lame + 2 * mu]) * PI2 / 2
     assert modes.u.shape == (169, 3, 2) and np.allclose(modes.values, exact, rtol=1e-3)
-    assert modes(0, [[0.3, 0.4]]).shape == (1, 2)
 
 
 def test_an_equation_without_a_mass():
@@ -169,6 +167,8 @@ def test_an_equation_without_a_mass():
 
     modes = js.eigen(js.Problem(operator, ends, fields=2), js.interval(0.0, 1.0, 31), 2, mass=(1.0, 0.0))
     assert np.allclose(modes.values, [np.pi**4, 16 * np.pi**4], rtol=1e-5)
+    u, w = modes(0, [[0.5]])[0]
+    assert abs(w / u / np.pi**2 - 1) < 1e-4
 
 
 def test_complex_values_of_a_drift_and_the_warning_of_a_strong_one(lattice):
@@ -211,7 +211,7 @@ def test_gradients_of_values_and_modes(plate):
     inner = cloud.groups["interior"][7]
 
     def some(a):
-        modes = js.eigen(problem.replace(params=a), cloud, 2, order=4, mass=lambda x: 1 + a * x[1])
+        modes = js.eigen(problem.replace(params=a), cloud, 2, order=2, mass=lambda x: 1 + a * x[1])
         return modes.values[1] + modes.u[inner, 0] + 2 * modes.u[inner, 1]
 
     slope = difference(some, 0.3)
@@ -237,21 +237,24 @@ def test_gradients_in_the_points(plate):
 
     def second(step):
         moved = js.Cloud(cloud.points + step * shift, cloud.groups, cloud.normals)
-        return js.eigen(problem, moved, 2, order=4, stencils=stencils).values[1]
+        return js.eigen(problem, moved, 2, order=2, stencils=stencils).values[1]
 
     slope = difference(second, 0.0, 1e-5)
     assert abs(jax.grad(second)(0.0) - slope) < 1e-5 * abs(slope)
 
 
 def test_values_of_a_cluster_move_with_their_mean():
-    cloud = js.rectangle((0, 0), (1, 1), (10, 10), jitter=0.2)
+    around = {"left": js.periodic("left", "right")}
+    even = js.interval(0.0, 1.0, 15)
+    moved = 0.2 * even.spacing * np.random.default_rng(0).uniform(-1, 1, (13, 1))
+    cloud = even.replace(points=even.points + np.pad(moved, ((1, 1), (0, 0))))
 
     def both(a):
-        problem = js.Problem(lambda u, x, a: -a * js.laplacian(u)(x), dict.fromkeys(SIDES, js.dirichlet(0.0)), params=a)
+        problem = js.Problem(lambda u, x, a: -a * js.laplacian(u)(x), around, params=a)
         return js.eigen(problem, cloud, 2, order=2).values
 
     assert both(1.5).shape == (3,)
-    assert np.allclose(slopes := jax.jacfwd(both)(1.5), both(1.5) / 1.5, rtol=1e-2)
+    assert np.allclose(slopes := jax.jacfwd(both)(1.5), both(1.5) / 1.5, rtol=1e-2, atol=1e-8)
     assert slopes[1] == slopes[2] and abs(slopes[1:].sum() - both(1.5)[1:].sum() / 1.5) < 1e-8
 
 

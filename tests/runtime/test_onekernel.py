@@ -12,6 +12,7 @@ import pytest
 import jsmitsm as js
 from jsmitsm.runtime import one_kernel, whole_program
 
+METHODS = ("I", "II", "III", "S", "SSPH")
 needs_one_kernel = pytest.mark.skipif(not one_kernel.available(), reason="this JAX makes no single kernels")
 X = np.array([0.3, -0.4, 1.2])
 
@@ -58,8 +59,7 @@ def test_an_operation_that_no_kernel_holds_takes_many():
 
 
 @needs_one_kernel
-@pytest.mark.parametrize("method", ["I", "II", "III", "S", "SSPH"])
-@pytest.mark.parametrize("side", [9, 50])
+@pytest.mark.parametrize("side, method", [*((9, m) for m in METHODS), (50, "S"), (50, "II")])
 def test_the_local_phase_is_one_kernel(method, side, monkeypatch):
     made = []
 
@@ -80,8 +80,7 @@ def held(cloud, value):
     return {g: js.dirichlet(value) for g in cloud.groups if g != "interior"}
 
 
-@pytest.mark.parametrize("method", ["I", "II", "III", "S", "SSPH"])
-@pytest.mark.parametrize("dim", [1, 2, 3])
+@pytest.mark.parametrize("dim, method", [*((1, m) for m in METHODS), (2, "S"), (2, "I"), (3, "S")])
 def test_one_kernel_gives_the_numbers_of_many(method, dim, monkeypatch):
     clouds = js.interval(0, 1, 30), js.rectangle((0, 0), (1, 1), (9, 9)), js.box((0, 0, 0), (1, 1, 1), (5, 5, 5))
     cloud = clouds[dim - 1]

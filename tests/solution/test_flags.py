@@ -1,6 +1,7 @@
 """Solutions say what speaks against them; healthy ones say nothing."""
 
 import pickle
+import warnings
 
 import jax
 import jax.numpy as jnp
@@ -155,6 +156,25 @@ def test_neighbours_on_a_line_have_a_condition_without_bound():
     usual, bad = (sol.condition_numbers() for sol in solved)
     inside = thin.groups["interior"]
     assert bad[0][inside].max() > 100.0 * usual[0][inside].max()
+
+
+def test_float32_is_told_once_unless_the_particles_are_given_in_it():
+    """Values come as float64 from the global solve: their dtype does not tell."""
+    problem = js.Problem(lambda u, x: js.laplacian(u)(x) + 1.0, dict.fromkeys(("left", "right"), js.dirichlet(0.0)))
+    line = js.interval(0.0, 1.0, 9)
+    meant = js.Cloud(line.points.astype(np.float32), line.groups, line.normals)
+    with jax.enable_x64(False), warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert abs(float(js.solve(problem, meant).u[4]) - 0.125) < 1e-5  # a hundred units of round-off
+        with pytest.raises(UserWarning, match="float32.*jax_enable_x64"):
+            js.solve(problem, line)
+        warnings.simplefilter("always")
+        with pytest.warns(UserWarning, match="float32.*jax_enable_x64") as told:
+            js.solve(problem, line), js.solve(problem, line)
+        assert len(told) == 1
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        js.solve(problem, js.interval(0.0, 1.0, 9))
 
 
 def test_coordinates_that_float32_cannot_hold():

@@ -8,7 +8,8 @@ import jsmitsm as js
 from jsmitsm.discretization.coefficients import numbers
 from jsmitsm.discretization.layout import discretize
 from jsmitsm.solution.estimate import comparable
-from jsmitsm.solution.flags import SQUARED, share
+from jsmitsm.solution.flags import SQUARED
+from jsmitsm.solution.look.sizes import share
 
 
 def exact(x):

@@ -279,11 +279,11 @@ def test_bad_input(change, said):
 
 def test_the_kernel_of_solve_where_none_is_given():
     """It starts where solve stands, and moves all smoothing lengths by one factor."""
-    found = room.tune(problem, cloud, steps=3, progress=False)
-    start = js.solve(problem, cloud)
+    found = room.tune(problem, cloud, order=2, steps=3, progress=False)
+    start = js.solve(problem, cloud, order=2)
     np.testing.assert_allclose(found.history["h"][0] / found.kernel.h, (found.history["h"][0] / found.kernel.h)[0])
     kernel = found.kernel.replace(h=found.history["h"][0], d=found.history["d"][0])
-    apart = np.linalg.norm(np.asarray(js.solve(problem, cloud, kernel=kernel).u - start.u))
+    apart = np.linalg.norm(np.asarray(js.solve(problem, cloud, order=2, kernel=kernel).u - start.u))
     assert apart < 1e-12 * np.linalg.norm(start.u)
     assert found.history["objective"].min() <= found.history["objective"][0]
     with pytest.raises(ValueError, match="kernel: expected a kernel such as"):

@@ -60,7 +60,7 @@ def lattice_part(
     ticks = [np.arange(np.floor(a), np.ceil(b) + 1) for a, b in zip(corners.min(axis=0), corners.max(axis=0))]
     index = _in_box(ticks, lo + shift @ basis, basis, low, high)
     place = lo + (index + shift) @ basis
-    points = place + _JITTER * h * _disorder(index, seed)
+    points = place + _JITTER * h * disorder(index, seed)
     kept = clear(region, points, boundary, np.full(len(points), h), _KEPT[dim])
     place, points = place[kept], points[kept]
     if not len(points):
@@ -83,7 +83,7 @@ def _in_box(ticks: list[np.ndarray], origin: np.ndarray, basis: np.ndarray, low:
     return np.concatenate(found)
 
 
-def _disorder(index: np.ndarray, seed: int) -> np.ndarray:
+def disorder(index: np.ndarray, seed: int) -> np.ndarray:
     """Numbers (M, D) between -1 and 1 that hang on whole-numbered coordinates (M, D) and the seed (splitmix64)."""
     def mixed(z: np.ndarray) -> np.ndarray:
         z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)

@@ -50,25 +50,35 @@ class Cells(NamedTuple):
     spacing: np.ndarray
 
 
-def refine(
-    region: Region, spacing: Spacing, lo: np.ndarray, hi: np.ndarray, fraction: float, inside: bool, base: float = 0.0
-) -> tuple[Cells, Cells]:
-    """Split cubes until none is wider than ``fraction`` of the spacing.
-
-    Returns the finished cells near the boundary (with ``inside`` also those in the domain) and the
-    coarse ones left behind. ``base`` is the width to start from, chosen here where it is 0.
-    """
+def base_cells(lo: np.ndarray, hi: np.ndarray, base: float = 0.0) -> tuple[np.ndarray, float, np.ndarray]:
+    """Centres (M, D), width and counts (D,) of the cells from which an octree over a box is refined."""
     dim = len(lo)
     width = base or float((hi - lo).max()) / BASE[dim]
     counts = np.maximum(np.ceil((hi - lo) / width - 1e-9).astype(int), 1)
     start = (lo + hi) / 2 - counts * width / 2
     index = np.stack(np.meshgrid(*map(np.arange, counts), indexing="ij"), axis=-1).reshape(-1, dim)
-    centers = start + (index + 0.5) * width
+    return start + (index + 0.5) * width, width, counts
+
+
+def refine(
+    region: Region, spacing: Spacing, lo: np.ndarray, hi: np.ndarray, fraction: float, inside: bool, base: float = 0.0,
+    kept: np.ndarray | None = None,
+) -> tuple[Cells, Cells]:  # fmt: skip
+    """Split cubes until none is wider than ``fraction`` of the spacing.
+
+    Returns the finished cells near the boundary (with ``inside`` also those in the domain) and the
+    coarse ones left behind. ``base`` is the width to start from, chosen here where it is 0; ``kept`` (M,) a mask of the
+    cells to start from.
+    """
+    dim = len(lo)
+    centers, width, counts = base_cells(lo, hi, base)
     children = np.array(list(itertools.product((-0.25, 0.25), repeat=dim)))
     done: list[Cells] = []
     left: list[Cells] = []
     distance, outward = region.distance(centers)
     changes = _sign_changes(np.sign(distance).reshape(counts)).reshape(-1)
+    if kept is not None:
+        centers, distance, outward, changes = (x[kept] for x in (centers, distance, outward, changes))
     while len(centers):
         # Twice the half diagonal: a signed distance function may be wrong by that factor.
         near = ~(np.abs(distance) > np.sqrt(dim) * width) | changes

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from jsmitsm.cloud.packing.octree import Region, Spacing
 
+# Particles per spacing^D of the densest even arrangement: hexagons in 2D; in 3D a little below the
+# 1.41 of a face-centred lattice, which relaxation from a random start does not find.
+DENSITY = {1: 1.0, 2: 2.0 / np.sqrt(3.0), 3: 1.25}
 _NEIGHBOURS = {2: 8, 3: 14}
 # Where the spacing varies, a force that scales with the mean of two spacings drives particles to the coarse side:
 # there are more of them on the fine side. This weight of the neighbour's spacing stops the drift (found by trial).
@@ -19,6 +24,25 @@ CLEARANCE = 0.5
 _MOVING, HELD = 3.5, 5.7
 # Particles lie unevenly where the nearest is closer than the first, or so many are not all closer than the last.
 _CLOSE, _AROUND, _APART = 0.8, {2: 5, 3: 9}, 1.45
+
+
+def settled(
+    region: Region, points: np.ndarray, boundary: np.ndarray, spacing: Spacing,
+    directions: Callable[[np.ndarray, int], np.ndarray],
+) -> np.ndarray:  # fmt: skip
+    """Scattered particles spread evenly: relaxed, thinned, holes between them filled.
+
+    directions: of particles (M, D) and a count n as many times n random directions (n M, D), of any length.
+    """
+    points = points[clear(region, points, boundary, spacing(points), 0.9 * CLEARANCE)]
+    if not len(points):
+        return points
+    points = relax(region, points, boundary, len(boundary), spacing, 8)
+    points = repair(region, points, boundary, spacing, directions)
+    points = relax(region, points, boundary, len(boundary), spacing, 4)
+    for _ in range(2):
+        points = relax_uneven(region, points, boundary, spacing, 6)
+    return points[clear(region, points, boundary, spacing(points), 0.8 * CLEARANCE)]
 
 
 def relax(
@@ -102,8 +126,9 @@ def clear(region: Region, points: np.ndarray, boundary: np.ndarray, h: np.ndarra
 
 
 def repair(
-    region: Region, points: np.ndarray, boundary: np.ndarray, spacing: Spacing, rng: np.random.Generator
-) -> np.ndarray:
+    region: Region, points: np.ndarray, boundary: np.ndarray, spacing: Spacing,
+    directions: Callable[[np.ndarray, int], np.ndarray],
+) -> np.ndarray:  # fmt: skip
     """Drop particles that are crowded, put new ones into holes."""
     from scipy.spatial import cKDTree
 
@@ -116,8 +141,7 @@ def repair(
     every = np.concatenate([points, boundary])
     tree = cKDTree(every)
     # A hole is seen from the particles around it: step off in some directions, then away from whatever is nearest.
-    count = len(points)
-    direction = rng.normal(size=(_PROBES * count, points.shape[1]))
+    direction = directions(points, _PROBES)
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     h = np.tile(h, _PROBES)
     probes = np.tile(points, (_PROBES, 1)) + 0.8 * h[:, None] * direction

@@ -15,6 +15,7 @@ from jsmitsm.discretization.layout import Discretization, discretize, sorted_cla
 from jsmitsm.discretization.periodic import Images
 from jsmitsm.discretization.supports import default_size
 from jsmitsm.equation.closing import with_recorded
+from jsmitsm.equation.conditions import Group
 from jsmitsm.equation.problem import Problem
 from jsmitsm.equation.regions.between import Between, between, check_regions, region_of
 from jsmitsm.equation.regions.per_region import PerRegion
@@ -59,6 +60,7 @@ class Regions:
     near: np.ndarray  # (N, w) every particle's neighbours in its own region, numbered in the whole cloud
     held: np.ndarray  # (N, F)
     images: Images
+    given_stencils: bool = False  # the user's: nothing outside them is looked at
     kernel: None = None
     part: None = None  # of a cloud that several processes share
     contrast: float = 1.0  # of the conductivities on both sides of an interface, the largest
@@ -110,8 +112,9 @@ class Regions:
         return number.reshape(self.held.shape)
 
     @property
-    def groups(self) -> list[Any]:
-        return []
+    def groups(self) -> list[Group]:
+        """The conditions of all regions' boundaries."""
+        return [replace(g, ids=p.ids[g.ids]) for p in self.parts for g in p.disc.groups]
 
     @property
     def stencils(self) -> Any:
@@ -158,7 +161,7 @@ def discretize_regions(
         bound = np.isin(p.ids[p.disc.active], copies)
         p.disc.classes = sorted_classes(p.disc, p.disc.active[~bound], p.disc.stencils)
     table = near if near is not None else _table(made, len(cloud))
-    return Regions(problem, cloud, made, interfaces, meetings, table, held, none)
+    return Regions(problem, cloud, made, interfaces, meetings, table, held, none, near is not None)
 
 
 def _region(

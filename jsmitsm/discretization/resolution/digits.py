@@ -1,14 +1,16 @@
-"""How deep a recursion may go before round-off shows: degrees that cost more digits than they gain are left out."""
+"""The digits there are: whether JAX computes in float32, and how deep a recursion may go before round-off shows."""
 
 from __future__ import annotations
 
+import warnings
 from typing import Any
 
+import jax
 import numpy as np
 
-from jsmitsm.cloud.cloud import Cloud
+from jsmitsm.cloud.cloud import Cloud, kept
+from jsmitsm.discretization.parts.whole import Part
 from jsmitsm.discretization.resolution.turning import USUAL, few, turning
-from jsmitsm.discretization.supports import Part
 from jsmitsm.equation.traced import Traced
 from jsmitsm.particle.recursion import Recursion
 from jsmitsm.runtime.tracers import concrete, is_traced
@@ -23,6 +25,22 @@ LOOKED_AT = 64
 # more than the second they oscillate. Of a constant operator it is worth a look from the third order on, up to the
 # fourth there is room for more.
 MILD, OSCILLATING, WORTH, HIGH = 0.8, 3.2, 6, 10
+SINGLE = (
+    "JAX computes in float32 here, the solution has seven digits at most and fewer at higher orders; put "
+    'jax.config.update("jax_enable_x64", True) at the beginning of the program, or where it is meant give particles in '
+    "float32, js.Cloud(points.astype(np.float32), groups, normals)"
+)
+
+
+def warn_of_float32(cloud: Cloud) -> None:
+    """Say that values look like float64 and are not, once a cloud; whoever gives float32 knows."""
+
+    def warn() -> bool:
+        warnings.warn(SINGLE, stacklevel=4)
+        return True
+
+    if cloud.points.dtype == np.float64 and not jax.config.jax_enable_x64:
+        kept(cloud, SINGLE, warn)
 
 
 def suited_depth(

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import product
 
 import numpy as np
 
 from jsmitsm.discretization.coefficients import Numbers
 from jsmitsm.discretization.layout import Discretization
+from jsmitsm.discretization.parts.whole import whole
 from jsmitsm.discretization.resolution.residuals import followed
-from jsmitsm.discretization.rows import all_coefficients
 from jsmitsm.equation.problem import Problem
 from jsmitsm.taylor.multi_indices import multi_indices
 
@@ -20,15 +20,18 @@ JUMP = 0.5
 CHUNK = 8192
 
 
-def steepness(disc: Discretization, nums: Numbers, problem: Problem, values: np.ndarray, most: float) -> np.ndarray:
+def steepness(
+    disc: Discretization, nums: Numbers, problem: Problem, fitted: Callable[[], np.ndarray], most: float
+) -> np.ndarray:  # fmt: skip
     """By how much the coefficients at the nearest neighbours differ from the particles' Taylor polynomials, (N,).
 
     Each counts as it enters the recursion, scaled by the distance, in parts of the largest. Of degree 0 the
-    polynomials are constants. No more than ``most`` where the solution follows the equation to the neighbour.
+    polynomials are constants. No more than ``most`` where the solution, whose polynomials (N, F, K) ``fitted`` makes,
+    follows the equation to the neighbour.
     """
     rec, jac = disc.rec, np.asarray(nums.jac, float)
     power = np.array([[rec.levels[e] - sum(b) - rec.weights[f] for f, b in rec.slots] for e in range(len(rec.levels))])
-    worst, fitted = np.zeros(len(disc.cloud)), None
+    worst, steep = np.zeros(len(disc.cloud)), []
     for ids, here, there, offset in _pairs(disc, nums):
         length = np.linalg.norm(offset, axis=1) ** power[..., None]
         t = np.stack([np.prod(offset ** np.array(a), axis=1) for a in multi_indices(rec.dim, rec.degree)])
@@ -37,14 +40,18 @@ def steepness(disc: Discretization, nums: Numbers, problem: Problem, values: np.
         part = (away.max(axis=1) / np.where(size > 0, size, 1.0)).max(axis=0)
         bad = np.flatnonzero(part > most)
         if len(bad):
-            fitted = np.asarray(all_coefficients(disc, nums, values)) if fitted is None else fitted
-            fine = followed(disc, problem, fitted, ids[bad], nums.ids[there[bad]], offset[bad])
-            part[bad[fine]] = most
+            steep.append((ids[bad], part[bad], nums.ids[there[bad]], offset[bad]))
+            part[bad] = most
         worst[ids] = np.maximum(worst[ids], part)
+    if whole(disc).most(len(steep)):
+        u = fitted()
+        for ids, part, near, offset in steep:
+            part = np.where(followed(disc, problem, u, ids, near, offset), most, part)
+            worst[ids] = np.maximum(worst[ids], part)
     return worst
 
 
-def unseen(disc: Discretization, nums: Numbers, problem: Problem, values: np.ndarray) -> np.ndarray:
+def unseen(disc: Discretization, nums: Numbers, problem: Problem, fitted: Callable[[], np.ndarray]) -> np.ndarray:
     """Which particles (N,) have a neighbour to which a leading coefficient jumps while both their slopes deny it.
 
     The recursion knows a coefficient by its derivatives at the particles: of such a jump it knows nothing, nor do the
@@ -60,21 +67,23 @@ def unseen(disc: Discretization, nums: Numbers, problem: Problem, values: np.nda
         jumps = (np.abs(a - b) > JUMP * largest) & (largest > 0)
         if jumps.any():
             pairs.append((ids, here, there, offset, jumps))
-    if not pairs:
+    if not whole(disc).most(len(pairs)):
         return found
     if rec.degree == 0:
         if not disc.linear:
             return found
         jac = np.asarray(disc.traced.coefficients(np.asarray(disc.cloud.points)[nums.ids], 1, params=problem.params)[0])
-    slopes, fitted = jac[:, leading, 1 : 1 + rec.dim], None
+    slopes, lost = jac[:, leading, 1 : 1 + rec.dim], []
     for ids, here, there, offset, jumps in pairs:
         change = jac[:, leading, 0][..., there] - jac[:, leading, 0][..., here]
         told = 0.5 * np.einsum("esdn,nd->esn", slopes[..., here] + slopes[..., there], offset)
         bad = np.flatnonzero((jumps & ((change - told) * np.sign(change) > 0.6 * np.abs(change))).any(axis=(0, 1)))
         if len(bad):
-            fitted = np.asarray(all_coefficients(disc, nums, values)) if fitted is None else fitted
-            lost = ~followed(disc, problem, fitted, ids[bad], nums.ids[there[bad]], offset[bad])
-            found[ids[bad[lost]]] = True
+            lost.append((ids[bad], nums.ids[there[bad]], offset[bad]))
+    if whole(disc).most(len(lost)):
+        u = fitted()
+        for ids, near, offset in lost:
+            found[ids[~followed(disc, problem, u, ids, near, offset)]] = True
     return found
 
 

@@ -11,7 +11,8 @@ import numpy as np
 
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.cloud.neighbours import reaches
-from jsmitsm.discretization.supports import Part, default_size
+from jsmitsm.discretization.parts.whole import Part
+from jsmitsm.discretization.supports import default_size
 from jsmitsm.equation.traced import Traced
 from jsmitsm.particle.elimination import Scheme
 from jsmitsm.particle.recursion import Recursion

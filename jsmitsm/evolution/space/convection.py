@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from jsmitsm.discretization.parts.whole import Part
 from jsmitsm.discretization.pencil.fits import local_fits
-from jsmitsm.discretization.supports import Part
 from jsmitsm.equation.field import unit
 from jsmitsm.evolution.space.semidiscrete import Semidiscrete
 

@@ -10,6 +10,7 @@ which the next fit is sought. It falls with the misfit (a driven cavity at order
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -17,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm.discretization.coefficients import slot_series
-from jsmitsm.discretization.layout import discretize, refuse_jumps
+from jsmitsm.discretization.layout import refuse_jumps
 from jsmitsm.equation.branches import FIELD
 from jsmitsm.runtime.errors import SolveError, some
 from jsmitsm.runtime.progress import bar
@@ -32,6 +33,7 @@ STALLED = 1e-7
 # Where only the first full step tells how large the solution is, it may be this much larger than that.
 WARY = 0.01
 NOTHING = "the equation says nothing"
+SHALLOW = "With a recursion deeper than the order Newton's steps do not settle; this is without depth."
 # So many full steps in the end, until one is this short.
 WANDERING, NEAR = 30, 1e-3
 
@@ -43,22 +45,28 @@ def newton(run: Run, u0: Any) -> tuple[Any, Any, Any, Any]:
     near the solution a step contracts errors of the expansions, and those of their derivatives
     alike, so that this is the implicit derivative and not that of the history.
     """
+    (values, taylor, _), good, steps, rate = sought(run, u0)
+    if rate is not None:
+        for _ in range(repeats(rate)):
+            values, taylor, _ = advance(run, taylor)
+    return values, taylor, good, steps
+
+
+def sought(run: Run, u0: Any) -> tuple[Iterate, Any, Any, float | None]:
+    """Where the iteration ends, whether it converged, the number of steps, and by how much one of them contracts where
+    something is traced, else None."""
     here, one = _first(run, Iterate(*start(run.disc, run.problem, u0)), u0 is None)
     if any(concrete(x) is None for x in one):
-        values, taylor, good, steps = _compiled(run, here)
+        at, good, steps = compiled(lambda old: advance(run, old.taylor), here, relative_change)
         rate = 0.1
     else:
         with bar("Newton steps") as shown:
             record = Record(run, shown)
             found = _searched(record, here.numbers(), one.numbers())
-        values, taylor, good = found.at.values, found.at.taylor, found.good
+        at, good, steps, rate = found.at, found.good, record.steps, record.rate
         run.changes = record.changes
-        steps, rate = record.steps, record.rate
-    refuse_jumps_at(run, values, taylor)
-    if is_traced(one):
-        for _ in range(repeats(rate)):
-            values, taylor, _ = advance(run, taylor)
-    return values, taylor, good, steps
+    refuse_jumps_at(run, at.values, at.taylor)
+    return at, good, steps, rate if is_traced(one) else None
 
 
 def refuse_jumps_at(run: Run, values: Any, taylor: Any) -> None:
@@ -120,7 +128,7 @@ def _searched(record: Record, begin: Iterate, first: Iterate) -> Found:
     ways = ["damped steps"]
     if record.run.disc.rec.depth and not best.good:
         ways.append("steps without depth")
-        best = _without_depth(record, begin) or best
+        best = without_depth(record, begin, _from_start) or best
         if not record.run.disc.rec.depth:
             return best
     for name, search in (("pseudo-time steps", _in_pseudo_time), ("full steps", wandering)):
@@ -159,36 +167,35 @@ def judged(run: Run, found: Found) -> Found:
     return found
 
 
-def _without_depth(record: Record, begin: Iterate) -> Found | None:
+def without_depth(record: Record, begin: Iterate, search: Callable[[Any, Iterate], Found]) -> Found | None:
     """From the solution where the recursion ends with the fit, for far from it deep expansions mislead.
 
     Where they mislead next to it too, as at the corner of a moving lid, it is the solution, and the run without depth.
+    None where there is no solution either. search: the way to one from a start.
     """
-    run, disc = record.run, record.run.disc
-    given = disc.stencils if disc.given_stencils else None
-    low = discretize(
-        run.problem, disc.cloud, disc.scheme.method, disc.rec.order, disc.kernel, given, disc.basis_terms,
-        sources=False, depth=0,
-    )  # fmt: skip
-    other = Record(Run(low, run.problem, run.solver, True, run.repair, run.formulation), record.shown)
-    here = begin._replace(taylor=begin.taylor[:, :, : low.rec.size])
+    other, size = record.shallow(), record.run.disc.rec.size
+    low = other.run.disc.rec.size
     try:
-        found = _searched(other, here, advance(other.run, here.taylor).numbers())
+        found = search(other, begin._replace(taylor=begin.taylor[:, :, :low]))
     except SolveError:
         return None
     finally:
         record.steps, record.solves = record.steps + other.steps, record.solves + other.solves
+    if not found.good:
+        return None
     record.changes += other.changes
-    more = disc.rec.size - low.rec.size
-    near = found.at._replace(taylor=np.pad(found.at.taylor, ((0, 0), (0, 0), (0, more))))
+    near = found.at._replace(taylor=np.pad(found.at.taylor, ((0, 0), (0, 0), (0, size - low))))
     step = record.tried(near)
     deep = None if step is None else damped(record, near, step)
     if deep is not None and deep.good:
         return deep
-    run.become(other.run)
-    run.messages.append("With a recursion deeper than the order Newton's steps do not settle; this is without depth.")
-    record.rate = other.rate
+    record.become(other)
+    record.run.messages.append(SHALLOW)
     return found
+
+
+def _from_start(record: Record, begin: Iterate) -> Found:
+    return _searched(record, begin, advance(record.run, begin.taylor).numbers())
 
 
 def _in_pseudo_time(record: Record, begin: Iterate, first: Iterate) -> Iterate | None:
@@ -216,22 +223,30 @@ def wandering(record: Record, begin: Iterate, first: Iterate) -> Iterate | None:
     return None
 
 
-def _compiled(run: Run, here: Iterate) -> tuple[Any, Any, Any, Any]:
-    """Undamped Newton's method where no number can be looked at (under jit)."""
+def compiled(
+    step: Callable[[Iterate], Iterate], here: Iterate, change: Callable[[Iterate, Iterate], Any]
+) -> tuple[Iterate, Any, Any]:
+    """Undamped Newton's method where no number can be looked at (under jit): where it ends, whether well, the steps.
+
+    change: of a new iterate and the old one, relative to the solution.
+    """
 
     def more(carry):
-        _, _, change, before, steps = carry
-        return (change > DONE) & (steps < MOST) & ~_stalled(change, before)
+        _, last, before, steps = carry
+        return (last > DONE) & (steps < MOST) & ~_stalled(last, before)
 
-    def step(carry):
-        values, taylor, before, _, steps = carry
-        new, taylor, _ = jax.lax.stop_gradient(advance(run, taylor))
-        change = jnp.max(jnp.abs(new - values)) / jnp.maximum(jnp.max(jnp.abs(new)), 1e-300)
-        return new, taylor, change, before, steps + 1
+    def stepped(carry):
+        old, before, _, steps = carry
+        new = jax.lax.stop_gradient(step(old))
+        return new, change(new, old), before, steps + 1
 
-    begin = (jnp.asarray(here.values, float), jnp.asarray(here.taylor, float), jnp.inf, jnp.inf, 0)
-    values, taylor, change, before, steps = jax.lax.while_loop(more, step, begin)
-    return values, taylor, (change <= GOOD) | _stalled(change, before), steps
+    begin = Iterate(*(jnp.asarray(x, float) for x in here)), jnp.inf, jnp.inf, 0
+    found, last, before, steps = jax.lax.while_loop(more, stepped, begin)
+    return found, (last <= GOOD) | _stalled(last, before), steps
+
+
+def relative_change(new: Iterate, old: Iterate) -> Any:
+    return jnp.max(jnp.abs(new.values - old.values)) / jnp.maximum(jnp.max(jnp.abs(new.values)), 1e-300)
 
 
 def _stalled(change: Any, before: Any) -> Any:

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jsmitsm.discretization.coefficients import held_values
 from jsmitsm.discretization.layout import Discretization
 from jsmitsm.equation.conditions import sample
 from jsmitsm.equation.problem import Problem
@@ -42,7 +43,8 @@ def start(disc: Discretization, problem: Problem, u0: Any) -> tuple[Any, Any]:
 def harmonic(disc: Discretization) -> tuple[np.ndarray, np.ndarray] | None:
     """What ``start`` gives for values that spread from the held ones into the cloud; None where that is flat.
 
-    Every value is the mean of its neighbours', which for linear data on a lattice is the linear function.
+    Every value is the mean of its neighbours', which for linear data on a lattice is the linear function, on an
+    interface of those on both sides.
     """
     from scipy import sparse
     from scipy.sparse.linalg import spsolve
@@ -50,20 +52,20 @@ def harmonic(disc: Discretization) -> tuple[np.ndarray, np.ndarray] | None:
     near = disc.stencils.indices
     if is_traced(near, disc.points):
         return None
-    held = np.zeros(disc.held.shape)
-    for group in disc.groups:
-        for k, value in group.held.items():
-            known = concrete(value())
-            if known is None:
-                return None
-            held[group.ids, k] = known
+    held = concrete(held_values(disc))
+    if held is None:
+        return None
+    held = np.asarray(held)
     points, near, n = np.asarray(disc.points), np.asarray(near), len(held)
     away = np.where(near >= 0, np.linalg.norm(points[np.maximum(near, 0)] - points[:n, None], axis=2), np.inf)
     nearest = np.argsort(away, axis=1, kind="stable")[:, : 1 + 2 * disc.rec.dim]
     near = disc.images.owners(np.take_along_axis(near, nearest, axis=1))
     at, others = np.repeat(np.arange(n), near.shape[1]), near.reshape(-1)
     keep = (others >= 0) & (others != at)
-    mean = sparse.csr_array((np.ones(keep.sum()), (at[keep], others[keep])), shape=(n, n))
+    at, others = at[keep], others[keep]
+    for pairs in getattr(disc.cloud, "interfaces", {}).values():
+        at, others = np.concatenate([at, *pairs.T]), np.concatenate([others, *pairs.T[::-1]])
+    mean = sparse.csr_array((np.ones(len(at)), (at, others)), shape=(n, n))
     laplace = (sparse.diags_array(mean.sum(axis=1)) - mean).tocsr()
     values = held.copy()
     for k in range(disc.rec.fields):

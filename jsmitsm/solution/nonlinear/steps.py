@@ -14,12 +14,14 @@ with s the inverse of the step. As the residual falls so does s (switched evolut
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from jsmitsm.discretization.layout import Discretization
+from jsmitsm.discretization.layout import Discretization, discretize
+from jsmitsm.discretization.regions.layout import Regions, discretize_regions
 from jsmitsm.runtime.errors import SolveError
 from jsmitsm.runtime.tracers import concrete
 from jsmitsm.solution.nonlinear.start import lengths
@@ -119,6 +121,23 @@ def advance(run: Run, taylor: Any, altered: Callable[..., Any] | None = None) ->
     return Iterate(values, run.expanded(nums, values))
 
 
+def shallow(run: Any) -> Any:
+    """A run of the same problem whose recursion ends with the fit, which raises where it fails."""
+    disc, other = run.disc, copy(run)
+    given = disc.stencils if disc.given_stencils else None
+    if isinstance(disc, Regions):
+        near = given and given.indices
+        other.disc = discretize_regions(run.problem, disc.cloud, disc.rec.order, 0, near, sources=False)
+    else:
+        other.disc = discretize(
+            run.problem, disc.cloud, disc.scheme.method, disc.rec.order, disc.kernel, given, disc.basis_terms,
+            sources=False, depth=0,
+        )  # fmt: skip
+    other.throw, other.health, other.linear, other.changes = True, None, {}, []
+    other.messages, other.against, other.seconds = [], [], dict.fromkeys(run.seconds, 0.0)
+    return other
+
+
 @dataclass
 class Record:
     """A search for a solution on one process, and what it has done; see ``damped.Search``."""
@@ -155,6 +174,15 @@ class Record:
         if length > ROUND_OFF * size or after > 100.0 * length or factor is None:
             return False
         return bool(length <= ROUNDING * factor.condition() * size)
+
+    def shallow(self) -> Record:
+        """One of the same problem where the recursion ends with the fit."""
+        return Record(shallow(self.run), self.shown)
+
+    def become(self, other: Any) -> None:
+        """Go on as another record."""
+        self.run.become(other.run)
+        self.rate = other.rate
 
     def frozen(self) -> Frozen:
         return Frozen(self.run.disc)

@@ -8,7 +8,7 @@ import numpy as np
 
 from jsmitsm.discretization.regions.layout import Meeting, Regions
 from jsmitsm.runtime.errors import some
-from jsmitsm.solution.flags import scales
+from jsmitsm.solution.look.sizes import scales
 from jsmitsm.taylor.multi_indices import count, multi_indices
 
 # Rows of copies that amplify their neighbours' errors by more than this are a flag: their values are lost.

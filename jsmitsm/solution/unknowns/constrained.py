@@ -14,6 +14,7 @@ import numpy as np
 from jsmitsm.discretization.leave_one_out import with_held
 from jsmitsm.equation.problem import Problem
 from jsmitsm.equation.unknowns.stated import floats
+from jsmitsm.runtime.jaxprs import used_inputs
 from jsmitsm.runtime.progress import bar
 from jsmitsm.runtime.tracers import concrete, is_traced
 from jsmitsm.solution.fit import Fit, Recipe
@@ -146,7 +147,7 @@ def _jointly(
         )
     found, good, steps = joint_newton(run, lines, start, u0)
     unknowns = {n: found.unknowns[k] for k, n in enumerate(lines.names)}
-    recipe = replace(recipe, formulation=run.formulation)
+    recipe = replace(recipe, formulation=run.formulation, depth=run.disc.rec.depth)
     return _finished(run, unknowns, found.values, found.taylor, good, steps, recipe, again)
 
 
@@ -208,6 +209,8 @@ def _response(run: Bordered, start: dict[str, Any]) -> Response | None:
     data, r, c, right = run.assembled(nums, parts)
     run.system, run.squares = (data, r, c), parts
     columns, held = [], []
+    if names and any(concrete(x) is None for x in nums.of_matrix) and _multiplies(run, start):
+        return None
     for name in names:
         disc = run.moved({**start, name: start[name] + 1.0})
         there = run.numbers_of(disc)
@@ -218,6 +221,15 @@ def _response(run: Bordered, start: dict[str, Any]) -> Response | None:
     xp: Any = jnp if is_traced(columns, held) else np
     empty = np.zeros((len(right), 0)), np.zeros((0, *np.shape(nums.held)))
     return Response(nums, right, *((xp.stack(columns, 1), xp.stack(held)) if names else empty))
+
+
+def _multiplies(run: Bordered, start: dict[str, Any]) -> bool:
+    """Whether the rows depend on an unknown, where no number tells."""
+
+    def rows(unknowns: dict[str, Any]) -> list[Any]:
+        return [x for x in run.numbers_of(run.moved(unknowns)).of_matrix if concrete(x) is None]
+
+    return any(used_inputs(jax.make_jaxpr(rows)(start).jaxpr))
 
 
 def _same(one: list[Any], two: list[Any]) -> bool:

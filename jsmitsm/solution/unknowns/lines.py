@@ -24,7 +24,7 @@ class Lines:
 
     def __init__(self, problem: Problem, run: Bordered, recipe: Recipe):
         assert problem.extras is not None
-        self.run, self.recipe = run, recipe
+        self.problem, self.run, self.recipe = problem, run, recipe
         self.constraints, self.names = problem.extras.constraints, list(problem.extras.unknowns)
         self.kind: Any = RegionsProbe if isinstance(run, BorderedRegionsRun) else Probe
 

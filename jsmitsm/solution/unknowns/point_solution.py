@@ -13,7 +13,7 @@ from jsmitsm.cloud.regions.region_cloud import RegionCloud
 from jsmitsm.equation.unknowns.point_source import Kelvin, Singular, derivative_of
 from jsmitsm.runtime.tracers import concrete, is_traced
 from jsmitsm.solution.evaluation import checked_points, in_domain
-from jsmitsm.solution.flags import NOTHING
+from jsmitsm.solution.look.sizes import NOTHING
 from jsmitsm.solution.regions.located import located
 from jsmitsm.solution.regions.solution import RegionsSolution
 from jsmitsm.solution.solution import Solution

@@ -1,0 +1,1 @@
+"""A cloud that several processes share."""

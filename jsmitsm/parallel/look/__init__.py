@@ -1,0 +1,1 @@
+"""What several processes say of a solution that they share."""
