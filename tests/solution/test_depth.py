@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import jsmitsm as js
+from jsmitsm.discretization.layout import discretize
 
 SIDES = ("left", "right", "bottom", "top")
 SQUARE = js.rectangle((0, 0), (1, 1), (12, 12), jitter=0.3)
@@ -214,6 +215,57 @@ def test_auto_goes_as_deep_as_pays():
     assert solved(poisson, exact, cube, order=2, depth="auto")[0].depth == 2
     assert solved(helmholtz, exact, cube, order=3, depth="auto")[0].depth == 2
     assert solved(poisson, wave, order=3, method="III", depth="auto")[0].depth == 0
+
+
+def deep(operator, exact, order=6, cloud=SQUARE, params=None):
+    """How deep it goes by itself; nothing is solved."""
+    held = {name: js.dirichlet(0.0) for name in cloud.groups if name != "interior"}
+    pde = lambda u, x, *p: operator(u, x) - exact(x, *p)
+    problem = js.Problem(pde, held, params=params)
+    return discretize(problem, cloud, "S", order, None, None, None, sources=False).rec.depth
+
+
+def turned(x, k):
+    return jnp.sin(k * (0.6 * x[0] + 0.8 * x[1]) + 0.3)
+
+
+@pytest.mark.parametrize(
+    "operator, k, order, depth",
+    [
+        (poisson, 2.0, 6, 4), (poisson, 8.0, 6, 4), (poisson, 20.0, 6, 6), (poisson, 2.0, 4, 4), (poisson, 20.0, 12, 4),
+        (diffusion, 1.0, 4, 2), (diffusion, 8.0, 4, 4), (diffusion, 20.0, 6, 4),
+        (lambda v, x: poisson(v, x) + 0.1 * v(x), 2.0, 6, 4), (lambda v, x: poisson(v, x) + 400.0 * v(x), 2.0, 6, 6),
+        (lambda v, x: poisson(v, x) + 20.0 * js.grad(v)(x)[0], 20.0, 6, 4),
+    ],
+)  # fmt: skip
+def test_the_data_decide_how_deep(operator, k, order, depth):
+    """By the angle k r, r the radius of a support, here about .25 at order 6: below .8 they are mild, above 3.2 they
+    oscillate; only a constant operator without convection goes deeper than four."""
+    assert deep(operator, lambda x: turned(x, k), order) == depth
+
+
+def test_what_cannot_be_known_is_taken_for_usual():
+    mild = lambda x: turned(x, 2.0)
+    assert deep(poisson, mild) == 4  # so few particles of a constant operator gain nothing by less
+    assert deep(poisson, mild, cloud=js.rectangle((0, 0), (1, 1), (33, 33))) == 2
+    assert deep(diffusion, mild) == 2
+    finer = js.from_polygon([(0, 0), (1, 0), (1, 1), (0, 1)], lambda x: 0.01 + 0.2 * np.linalg.norm(x, axis=1))
+    assert deep(diffusion, mild, cloud=finer) == 4  # supports of very different sizes
+    assert deep(diffusion, lambda x: jnp.abs(x[0] - 0.5)) == 4  # a kink
+    found = []
+
+    def in_sum(k):
+        found.append(deep(diffusion, lambda x, p: turned(x, p), params=k))
+        return 0.0 * k
+
+    in_sum(2.0), jax.grad(in_sum)(2.0), jax.jit(in_sum)(2.0)
+    assert found == [2, 2, 4]  # a derivative alone changes nothing
+
+
+def test_waves_are_worth_six_degrees():
+    exact = lambda x: turned(x, 20.0)
+    (usual, four), (found, six) = (solved(poisson, exact, order=6, depth=depth) for depth in (4, "auto"))
+    assert (usual.depth, found.depth) == (4, 6) and six * 1.5 < four
 
 
 @pytest.mark.parametrize(
