@@ -225,8 +225,7 @@ def table(rows):
     return lines
 
 
-def main():
-    names = arguments(__doc__, names="case").names
+def main(names):
     runs = [(n, lambda n=n, p=p: measured(n, p)) for n in CASES for p in CASES[n][2]]
     bounds = {2: 1e-3, 4: 4e-6, 6: 1e-8, 8: 1e-10}
     runs += [("wall", lambda p=p, b=b: of_the_wall(p, b)) for p, b in bounds.items()]
@@ -243,4 +242,4 @@ def main():
 
 
 if __name__ == "__main__":
-    main()
+    main(arguments(__doc__, names="case").names)

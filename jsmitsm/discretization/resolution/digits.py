@@ -39,7 +39,7 @@ def warn_of_float32(cloud: Cloud) -> None:
         warnings.warn(SINGLE, stacklevel=4)
         return True
 
-    if cloud.points.dtype == np.float64 and not jax.config.jax_enable_x64:
+    if cloud.points.dtype == np.float64 and not jax.config.read("jax_enable_x64"):
         kept(cloud, SINGLE, warn)
 
 
