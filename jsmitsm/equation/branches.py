@@ -91,10 +91,10 @@ def _either(some: Iterable[int]) -> int:
 
 def branching(jaxpr: Any) -> bool:
     """Whether any operation inside has outcomes rather than values."""
-    return any(_branches(eqn) or any(map(branching, inner_jaxprs(eqn))) for eqn in jaxpr.eqns)
+    return any(decides(eqn) or any(map(branching, inner_jaxprs(eqn))) for eqn in jaxpr.eqns)
 
 
-def _branches(eqn: Any) -> bool:
+def decides(eqn: Any) -> bool:
     """Whether a number that varies becomes an outcome."""
     name = eqn.primitive.name
     if not (name in _STEPS or name in _JUMPS or any(v.aval.dtype.kind in "biu" for v in eqn.outvars)):
@@ -217,7 +217,7 @@ class _Reader:
         step = not np.issubdtype(var.aval.dtype, np.inexact) or name in _STEPS or name in _JUMPS
         if name in _JUMPS:
             value = _JUMPS[name](*(v.value for v in operands))
-        if not hidden and not (step and _branches(eqn)):
+        if not hidden and not (step and decides(eqn)):
             return frozenset()
         self.outcomes.append(Outcome(None if hidden else value, depends, f"{_WORDS.get(name, _ANY)}{scope.place}"))
         return frozenset([len(self.outcomes) - 1])

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jsmitsm.equation.branches import Branches
+from jsmitsm.equation.branches import Branches, decides
 from jsmitsm.equation.jumps import jumps
 from jsmitsm.equation.linearizing import Record, open_fields, slots_of
 from jsmitsm.equation.record_form import Form, is_fixed
@@ -30,11 +30,10 @@ REMEMBERED = 6000
 CHUNK, LEAST = 60_000, 512
 # How many programs were traced for compilation since import; tests watch it.
 COMPILATIONS = 0
-# Operations on floats whose value or slope may jump; look-ups in tables are among them.
-KINKS = frozenset(
-    "abs max min clamp sign floor ceil round rem select_n reduce_max reduce_min cummax cummin argmax argmin sort "
-    "gather dynamic_slice cond while atan2".split()
-)
+# Operations on floats whose slope may jump, beside those whose outcomes choose or look up something.
+KINKS = frozenset("abs max min clamp reduce_max reduce_min cummax cummin sort".split())
+# Operations that may be infinite at a point; powers of whole numbers are, where these are negative.
+POLES = frozenset("div pow log log1p rsqrt tan lgamma digamma".split())
 
 
 @jax.tree_util.register_pytree_node_class
@@ -162,12 +161,30 @@ class Traced:
         consts = r.consts[len(r.consts) - len(r.written.constvars) :]
         return open_fields(r.written, consts, [x, *jax.tree.leaves(params)], asked)[0]
 
-    @cached_property
+    @property
     def kinked_source(self) -> bool:
         """Whether the source may have kinks or jumps, where its Taylor series end, and the coefficients have none."""
-        needed = lambda jac: levels(self._record.jaxpr, self._wanted(jac, not jac))  # noqa: E731
-        source, operator = (any(_kinked(eqn) for eqn, _ in needed(jac)) for jac in (False, True))
-        return source and not operator
+        return self._kinks == (True, False)
+
+    @property
+    def kinked(self) -> bool:
+        """Whether the source or a coefficient may have kinks or jumps."""
+        return any(self._kinks)
+
+    @cached_property
+    def _kinks(self) -> tuple[bool, bool]:
+        """Whether the source may have kinks or jumps, and whether the coefficients may."""
+        source, operator = (any(_kinked(eqn) for eqn in self._needed(jac)) for jac in (False, True))
+        return source, operator
+
+    @cached_property
+    def unbounded_source(self) -> bool:
+        """Whether the source may be infinite somewhere."""
+        return any(_unbounded(eqn) for eqn in self._needed(False))
+
+    def _needed(self, jac: bool) -> list[Any]:
+        """The operations that the coefficients, or the source, are made by."""
+        return [eqn for eqn, _ in levels(self._record.jaxpr, self._wanted(jac, not jac))]
 
     def with_any_numbers(self) -> Traced:
         """The same with some numbers for the constants that are only traced."""
@@ -361,7 +378,14 @@ class _Inputs:
 
 
 def _kinked(eqn: Any) -> bool:
-    return eqn.primitive.name in KINKS or any(_kinked(e) for inner in inner_jaxprs(eqn) for e in inner.eqns)
+    own = eqn.primitive.name in KINKS or decides(eqn)
+    return own or any(_kinked(e) for inner in inner_jaxprs(eqn) for e in inner.eqns)
+
+
+def _unbounded(eqn: Any) -> bool:
+    name = eqn.primitive.name
+    own = name in POLES or name == "integer_pow" and eqn.params["y"] < 0
+    return own or any(_unbounded(e) for inner in inner_jaxprs(eqn) for e in inner.eqns)
 
 
 def _zeros(value: Any) -> np.ndarray:

@@ -329,28 +329,32 @@ class Factor:
 def _scales(
     data: np.ndarray, rows: np.ndarray, cols: np.ndarray, n: int, columns: bool
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Powers of two that bring the largest entry of every row, then column, to about one."""
+    """Powers of two that bring the largest entry of every row, then column, to about one.
+
+    Lines without a diagonal entry, as those of multipliers, come last: a row of them says nothing of the units that
+    its unknowns have in the others.
+    """
     size = abs(data)
     if not np.isfinite(size).all():
         bad = np.unique(rows[~np.isfinite(size)])
         raise SingularMatrix("the matrix has entries that are not finite", bad)
-    row_scale, col_scale = np.ones(n), np.ones(n)
-    largest = np.zeros(n)
-    np.maximum.at(largest, rows, size)
-    if not largest.all():
-        raise SingularMatrix("equations without any coefficient", np.flatnonzero(largest == 0))
+    at = rows == cols
+    diagonal = np.bincount(rows[at], data[at], n)
+    lined = diagonal == 0
     # Equal signs on the diagonal: what the smoothers of multigrid expect.
-    diagonal = rows == cols
-    sign = np.where(np.bincount(rows[diagonal], data[diagonal], n) < 0, -1.0, 1.0)
-    row_scale = sign * np.exp2(-np.round(np.log2(largest)))
-    size *= abs(row_scale)[rows]
-    largest = np.zeros(n)
-    np.maximum.at(largest, cols, size)
-    if not largest.all():
-        raise SingularMatrix("unknowns that no equation contains", np.flatnonzero(largest == 0))
-    if columns:
-        col_scale = np.exp2(-np.round(np.log2(largest)))
-    return row_scale, col_scale
+    sign = np.where(diagonal < 0, -1.0, 1.0)
+    scales, lines = (np.ones(n), np.ones(n)), (rows, cols)
+    faults = "equations without any coefficient", "unknowns that no equation contains"
+    inner = ~(lined[rows] | lined[cols]) if lined.any() else slice(None)
+    for some, entries in ((~lined, inner), (lined, slice(None))):
+        for k in (0, 1) if some.any() else ():
+            largest = np.zeros(n)
+            np.maximum.at(largest, lines[k][entries], (size * scales[1 - k][lines[1 - k]])[entries])
+            if not largest[some].all():
+                raise SingularMatrix(faults[k], np.flatnonzero(some & (largest == 0)))
+            if columns or k == 0:
+                scales[k][some] = np.exp2(-np.round(np.log2(largest[some])))
+    return sign * scales[0], scales[1]
 
 
 def _largest(vector: np.ndarray) -> list[int]:

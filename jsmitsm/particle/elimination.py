@@ -292,7 +292,7 @@ def _deepened_on_host(
     deep = matrix[np.ix_(deeper, high)] * size
     unit = _row_lengths(deep, np)
     spread = np.concatenate([deep / unit[:, None], np.sqrt(_ridge(scheme)) * np.eye(len(deeper))], axis=1)
-    _, inverse = _refined(spread, np.eye(spread.shape[1]))
+    inverse = _inverted(spread)
     extension, across = size[:, None] * inverse[: len(high)] / unit, matrix[np.ix_(deeper, low)]
     whole, source = np.zeros((matrix.shape[1], basis.shape[1])), np.zeros(matrix.T.shape)
     whole[low], source[np.ix_(low, first)] = basis, particular
@@ -315,6 +315,30 @@ def _refined(matrix: np.ndarray, white: np.ndarray) -> tuple[np.ndarray, np.ndar
     null = q[:, k:] - inverse @ (whitened @ q[:, k:])
     inverse = inverse + inverse @ (np.eye(k) - whitened @ inverse)
     return (wide @ null).astype(float), (wide @ inverse).astype(float)
+
+
+def _inverted(matrix: np.ndarray) -> np.ndarray:
+    """The pseudo-inverse of a wide matrix, rounded once as above; tails of systems in 3D have a thousand columns, for
+    which products in extended precision would take minutes."""
+    q, r = np.linalg.qr(matrix.T)
+    inverse = q @ np.linalg.inv(r).T
+    # Numbers of so few bits have products whose sums are exact.
+    bits = (53 - int(np.ceil(np.log2(matrix.shape[1] + 1)))) // 2
+    a, b = _slices(matrix, 1, bits), _slices(inverse, 0, bits)
+    missed = np.eye(len(matrix)) - a[0] @ b[0]
+    missed = missed - (a[0] @ b[1] + a[1] @ b[0]) - (a[0] @ b[2] + a[1] @ b[1] + a[2] @ b[0])
+    return inverse + inverse @ missed
+
+
+def _slices(matrix: np.ndarray, axis: int, bits: int) -> list[np.ndarray]:
+    """Three matrices of numbers of so many bits, counted from the largest along an axis, that add up to the matrix."""
+    unit = np.exp2(np.ceil(np.log2(np.maximum(np.abs(matrix).max(axis=axis, keepdims=True), np.finfo(float).tiny))))
+    slices = []
+    for _ in range(3):
+        unit = unit * 0.5**bits
+        slices.append(np.rint(matrix / unit) * unit)
+        matrix = matrix - slices[-1]
+    return slices
 
 
 def _all_free(scheme: Scheme) -> np.ndarray:

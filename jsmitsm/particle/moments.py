@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jsmitsm.particle.elimination import Deep, Elimination, Scheme, transposed
+from jsmitsm.particle.elimination import Deep, Elimination, Scheme, as_matrix, transposed
 from jsmitsm.particle.kernels import EDGE, Kernel, fitted
 from jsmitsm.particle.polynomials import FEW, Combinations, functionals, monomials
 from jsmitsm.particle.recursion import Recursion, fit_and_tail
@@ -258,9 +258,7 @@ class Block(NamedTuple):
 def block(scheme: Scheme, near: Support, solution: Elimination, own: Any, data: Any) -> Block:
     """The least-squares misfit of the particle's local fit as a quadratic form of its data."""
     system = local_system(scheme, near, solution, own, data, None, skip_self=False)
-    n_source = scheme.rec.n_rows
-    each = jnp.eye(n_source + scheme.n_own)[0 if scheme.sourced else n_source :]
-    part = jax.vmap(partial(particular_part, scheme, solution, system))(each[:, :n_source], each[:, n_source:])
+    part = _parts(scheme, solution, system)
     root = safe_root(system.weight)
     a = root[:, None] * system.phi
     misfit = jnp.diag(system.weight) - root[:, None] * (a @ solve_gram(a, gram_inverse(a), a.T)) * root
@@ -268,7 +266,31 @@ def block(scheme: Scheme, near: Support, solution: Elimination, own: Any, data: 
     ns = near.weight.shape[0]
     power = balance(scheme.rec, near.length, solution)
     scale = jnp.concatenate([jnp.tile(power, ns), system.data_scale.reshape(-1)])
-    return Block(scale[:, None] * misfit * scale, scale[:, None] * (misfit @ (system.values @ part.T)))
+    return Block(scale[:, None] * misfit * scale, scale[:, None] * (misfit @ _looked_at(scheme, ns, system, part)))
+
+
+def _parts(scheme: Scheme, solution: Elimination, system: System) -> Any:
+    """What each number of the recursion's right-hand side, where the scheme is sourced, and of the own conditions adds
+    to ``particular_part``: (F K, rows + n_own)."""
+    columns = []
+    if scheme.sourced:
+        part = as_matrix(solution.particular) * solution.lift
+        if scheme.n_own:
+            part = part - solution.basis @ (system.own_solve @ (system.own_rows @ part))
+        columns.append(part)
+    if scheme.n_own:
+        columns.append(solution.basis @ (system.own_solve * system.own_scale))
+    return jnp.concatenate(columns, axis=1) if columns else jnp.zeros((solution.basis.shape[0], 0))
+
+
+def _looked_at(scheme: Scheme, ns: int, system: System, part: Any) -> Any:
+    """The data (rows of data, m) of local polynomials (F K, m); a neighbour's value hangs on its own field alone."""
+    fields = scheme.rec.fields
+    if fields == 1 or isinstance(system.values, Combinations):
+        return system.values @ part
+    own = system.values[: ns * fields : fields, : scheme.rec.size]
+    seen = jnp.einsum("gk,fkm->gfm", own, part.reshape(fields, scheme.rec.size, -1)).reshape(ns * fields, -1)
+    return jnp.concatenate([seen, system.values[ns * fields :] @ part])
 
 
 def particular_part(scheme: Scheme, solution: Elimination, system: System, source: Any, given: Any) -> Any:

@@ -18,6 +18,7 @@ from jsmitsm.solution.anywhere import Anywhere
 from jsmitsm.solution.estimate import Correction, correction
 from jsmitsm.solution.fit import Recipe
 from jsmitsm.solution.flags import SQUARED, too_large
+from jsmitsm.solution.look.between import beyond_kinks
 from jsmitsm.solution.look.sizes import NOTHING, share
 from jsmitsm.solution.run import Run
 
@@ -118,7 +119,8 @@ class Solution(Anywhere):
         """Estimated error |u - u_exact| at every particle: what leads to the solution of order p + 2.
 
         Computed when asked for: one more assembly at order p + 2 and one more solve. Where rows of that order are weak,
-        and in the least-squares form, a lower order is asked too.
+        and in the least-squares form, a lower order is asked too. Where a linear problem has kinks or jumps, which no
+        order sees, what they make of the solution is measured beside.
 
         Returns
         -------
@@ -154,8 +156,11 @@ class Solution(Anywhere):
 
     def _size(self, found: Correction) -> Array:
         """The size of an estimated error, kept for the next who asks."""
-        error = abs(found.error)[..., 0] if self._recipe.fields == 1 else abs(found.error)
-        return self._kept(error, found.units)
+        error = abs(found.error)
+        if isinstance(self._report, Run) and not is_traced(error, self._values):
+            beyond = beyond_kinks(self._report, self._values)
+            error = error if beyond is None else np.maximum(error, beyond)
+        return self._kept(error[..., 0] if self._recipe.fields == 1 else error, found.units)
 
     def _kept(self, error: Array, units: Any = 1.0) -> Array:
         if not is_traced(error, self._values):

@@ -600,3 +600,13 @@ def test_matrices_that_differ_in_their_entries_alone_share_the_places():
         assert np.array_equal(solve(np.full(5, scale), rows, cols, b, n=5, solver="sparse"), x)
         assert np.allclose(x, 1.0 / scale)
     assert factorisations() == before
+
+
+def test_the_condition_of_a_saddle_knows_no_units():
+    """A velocity, a pressure in units of ``unit``, and the multiplier of its mean, as ``Run`` puts them together."""
+    found = []
+    for unit in (1.0, 2.0**-30, 2.0**30):
+        a = np.array([[3.0, unit, 0.0], [unit, 2.0 * unit**2, unit], [0.0, unit, 0.0]])
+        r, c = np.nonzero(a)
+        found.append(sparse.Factor(a[r, c], r, c, 3).condition())
+    assert max(found) < 1.5 * min(found) < 50.0

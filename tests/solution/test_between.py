@@ -114,3 +114,33 @@ def test_a_steep_coefficient_that_the_solution_follows():
     ends = {"left": js.dirichlet(exact), "right": js.dirichlet(exact)}
     sol = js.solve(js.Problem(lambda u, x: flow(u)(x) - flow(exact)(x), ends), js.interval(0.0, 1.0, 21), order=6)
     assert abs(sol.u - jnp.sin(3.0 * sol.cloud.points[:, 0])).max() < 1e-5 and sol.flags == []
+
+
+@pytest.mark.parametrize("order, n", [(4, 41), (6, 21)])
+def test_no_order_sees_beyond_a_jump_but_the_estimate_does(order, n):
+    """u'' = 30 where x < 0.4 and 0 beyond; u'' = 200 u where x > 0.4 and 0 before: 1 to 18 % off, 1e-11 by orders."""
+    a, k = 0.4, 200.0**0.5
+    source = lambda x: jnp.where(x < a, 15.0 * x**2, 15.0 * a**2 + 30.0 * a * (x - a)) - 9.6 * x
+    slope = -1.0 / (a + jnp.tanh(k * (1.0 - a)) / k)
+    rate = lambda x: jnp.where(x < a, 1 + slope * x, (1 + slope * a) * jnp.sinh(k * (1 - x)) / jnp.sinh(k * (1 - a)))
+    for exact, pde in (
+        (source, lambda u, x: js.laplacian(u)(x) - jnp.where(x[0] < a, 30.0, 0.0)),
+        (rate, lambda u, x: js.laplacian(u)(x) - jnp.where(x[0] > a, k**2, 0.0) * u(x)),
+    ):
+        line = js.interval(0.0, 1.0, n)
+        sol = js.solve(js.Problem(pde, {s: js.dirichlet(lambda x, f=exact: f(x[0])) for s in ENDS}), line, order=order)
+        right = np.asarray(exact(jnp.asarray(line.points[:, 0])))
+        error, told = (np.linalg.norm(e) / np.linalg.norm(right) for e in (sol.u - right, sol.error_estimate()))
+        assert error > 0.01 and 0.3 < told / error < 5.0 and (sol.flags or told < 0.02)
+
+
+def test_branches_without_a_kink_leave_the_estimate_alone():
+    """A trace is a choice by constants, and a division made safe never is by zero."""
+    ends = dict.fromkeys(ENDS, js.dirichlet(0.0))
+    for bend in (
+        lambda x: jnp.trace(x * jnp.eye(2)),
+        lambda x: 2.0 * jnp.where(x > -1.0, x, 1.0),
+        lambda x: 2.0 * jnp.abs(x + 0.1) - 0.2,
+    ):
+        sol = js.solve(js.Problem(lambda u, x, f=bend: js.laplacian(u)(x) - f(x[0]), ends), js.interval(0.0, 1.0, 11))
+        assert sol.error_estimate().max() < 1e-12 and not sol.flags

@@ -18,10 +18,10 @@ MISSED, STEP = 0.05, 0.5
 
 def residual(disc: Discretization, problem: Problem, at: np.ndarray, offset: np.ndarray, u: np.ndarray) -> np.ndarray:
     """The residual (E, n) of polynomials u (n, F, K) at their centres plus ``offset``, which is ``at``."""
-    return _evaluated(disc, problem, at, offset, u)[0]
+    return evaluated(disc, problem, at, offset, u)[0]
 
 
-def _evaluated(disc: Discretization, problem: Problem, at: np.ndarray, offset: np.ndarray, u: np.ndarray) -> tuple:
+def evaluated(disc: Discretization, problem: Problem, at: np.ndarray, offset: np.ndarray, u: np.ndarray) -> tuple:
     """The same, the operator's coefficients (E, S, n) there, and what they are multiplied with (S, n)."""
     rec, traced = disc.rec, disc.traced
     powers = np.stack([np.prod(offset ** np.array(a), axis=1) for a in multi_indices(rec.dim, rec.reach)], axis=1)
@@ -51,7 +51,7 @@ def followed(
     good, before = np.ones(len(ids), bool), None
     for t in WAY:
         of, away = (ids, t * offset) if t <= 0.5 else (near, (t - 1.0) * offset)
-        missed, jac, value = _evaluated(disc, problem, points[ids] + t * offset, away, fitted[of])
+        missed, jac, value = evaluated(disc, problem, points[ids] + t * offset, away, fitted[of])
         largest = np.abs(jac * value).max(axis=1)
         good &= (np.abs(missed) <= MISSED * largest).all(axis=0)
         now = jac[:, leading]

@@ -1,7 +1,7 @@
 """What the particles do not see of a problem, and what it would make of the solution.
 
 Between them the residual that the local polynomials leave, where nothing made it small, and boundary data; beyond a
-periodic seam the equation on its other side.
+kink or a jump what the series of one side leave out, beyond a periodic seam the equation on its other side.
 """
 
 from __future__ import annotations
@@ -19,9 +19,10 @@ from jsmitsm.discretization.least_squares import least_squares
 from jsmitsm.discretization.leave_one_out import right_side
 from jsmitsm.discretization.parts.whole import whole
 from jsmitsm.discretization.periodic import with_corners
-from jsmitsm.discretization.resolution.residuals import residual
+from jsmitsm.discretization.resolution.residuals import evaluated, residual
 from jsmitsm.discretization.rows import all_coefficients, all_rows
 from jsmitsm.equation.problem import Problem
+from jsmitsm.taylor.multi_indices import multi_indices
 
 # A particle of the same group so many times as far as the nearest ones of all, or whose normal has less than this part
 # of the direction, is not beside.
@@ -29,14 +30,82 @@ NEAR, ASIDE = 1.5, 0.5
 # A coefficient or a source halfway is even where it differs from the mean of both ends by less than this part of them,
 # or of so small a part of the largest anywhere: ten particles a wavelength leave 0.05.
 UNEVEN, SMALL = 0.2, 0.01
+# A series ends at a kink where it misses what is halfway to a neighbour by so many times its last two degrees there,
+# and by more than this part of what is there.
+ENDED, FAINT = 3.0, 1e-6
 
 
 def between(run: Any, values: Any) -> np.ndarray:
     """What the residual between the particles makes of the solution of a run, (N, F)."""
     disc = run.disc
-    if disc.linear and disc.traced.constant and disc.traced.source != "variable":
+    if same_everywhere(disc):
         return np.zeros(disc.held.shape)
     return _made_of(run, unresolved(disc, run.nums, run.problem, run.fitted(run.nums, values)))
+
+
+def same_everywhere(disc: Discretization) -> bool:
+    """Whether the equation is the same at every point."""
+    return disc.linear and disc.traced.constant and disc.traced.source != "variable"
+
+
+def beyond_kinks(run: Any, values: Any) -> np.ndarray | None:
+    """What the series of a source or a coefficient leave out beyond its kinks and jumps makes of the solution, (N, F).
+
+    Rows of all orders know both by their series at the particles alone, and miss the same. None where there are no
+    kinks, or where the problem is nonlinear.
+    """
+    disc, nums = run.disc, run.nums
+    if nums is None or not has_kinks(disc) or run.factor is None:
+        return None
+    left_out = out_of_series(disc, nums, run.problem, run.fitted(nums, values))
+    return _made_of(run, left_out) if whole(disc).total(int(np.any(left_out.source))) else None
+
+
+def has_kinks(disc: Discretization) -> bool:
+    """Whether series of a linear problem may end within a support."""
+    return disc.linear and disc.traced.kinked and disc.rec.degree >= 2
+
+
+def out_of_series(disc: Discretization, nums: Numbers, problem: Problem, fitted: np.ndarray) -> Numbers:
+    """The numbers of the same operator with, for its source, what the series leave out halfway to the neighbours.
+
+    fitted (N, F, K): the local polynomials.
+    """
+    points, place = np.asarray(disc.points, float), np.full(len(disc.cloud), -1)
+    place[nums.ids] = np.arange(len(nums.ids))
+    missed = np.zeros((disc.rec.n_rows, len(nums.ids)))
+    for cls in disc.classes:
+        at = place[cls.ids]
+        left = lambda there, offset, u=fitted[cls.ids], at=at: _left_out(disc, nums, problem, there, offset, u, at)
+        missed[np.array(disc.rec.equation_rows)[:, None], at] = _around(disc, cls, points, left)
+    return with_source(nums, missed)
+
+
+def _left_out(
+    disc: Discretization, nums: Numbers, problem: Problem, there: np.ndarray, offset: np.ndarray, u: np.ndarray,
+    at: np.ndarray,
+) -> np.ndarray:  # fmt: skip
+    """By how much the equation ``there`` is another than its series at the particles ``at`` say, (E, n)."""
+    rec = disc.rec
+    residual_there, jac, value = evaluated(disc, problem, there, offset, u)
+    source = np.einsum("esn,sn->en", jac, value) - residual_there  # on the right of the equation, as in the numbers
+    powers = np.stack([np.prod(offset ** np.array(c), axis=1) for c in multi_indices(rec.dim, rec.degree)])
+    degrees = np.array([sum(c) for c in multi_indices(rec.dim, rec.degree)])
+
+    def ended(known: Any, series: Any, degree: int) -> np.ndarray:
+        """What the series (..., T, n) lack of the known (..., n), where that is more than they promise."""
+        series = np.asarray(series, float)
+        terms = (series if series.shape[-1] == 1 else series[..., at]) * powers[: series.shape[-2]]
+        away, last = known - terms.sum(axis=-2), terms[..., degrees[: series.shape[-2]] > degree - 2, :]
+        promised = np.maximum(ENDED * np.abs(last).sum(axis=-2), FAINT * np.abs(known))
+        bad = np.isfinite(away) & (np.abs(away) > promised)
+        return np.where(bad, away, 0.0)
+
+    found = np.einsum("esn,sn->en", ended(jac, nums.jac, rec.degree), value)
+    for e, degree in enumerate(rec.degrees):
+        rows = [k for k, (equation, _) in enumerate(rec.row_index) if equation == e]
+        found[e] -= ended(source[e], np.asarray(nums.source)[rows], degree)
+    return found
 
 
 def even(run: Any) -> bool:
@@ -45,7 +114,7 @@ def even(run: Any) -> bool:
     A look without polynomials: where it sees nothing, there is no need of theirs.
     """
     disc, points, told = run.disc, np.asarray(run.disc.points, float), whole(run.disc)
-    if not disc.linear or disc.traced.constant and disc.traced.source != "variable":
+    if not disc.linear or same_everywhere(disc):
         return disc.linear
 
     def at(x: np.ndarray) -> np.ndarray:
@@ -75,31 +144,38 @@ def _looked_at(disc: Discretization, cls: Class) -> np.ndarray:
 
 
 def unseen_data(run: Any) -> np.ndarray:
-    """What boundary data do between the particles, unseen by them, makes of the solution of a run, (N, F).
+    """What boundary data do between the particles, unseen by them, makes of the solution of a run, (N, F)."""
+    unseen = data_between(run.disc, run.nums, run.problem)
+    if unseen is None:
+        return np.zeros(run.disc.held.shape)
+    made = _made_of(run, unseen)
+    # A velocity that is zero has no scale to measure what the other's data make of it with.
+    given_in = whole(run.disc).total(np.any(unseen.held, axis=0).astype(int)) > 0
+    return np.where(given_in if given_in.any() else True, made, 0.0)
+
+
+def data_between(disc: Discretization, nums: Numbers, problem: Problem) -> Numbers | None:
+    """The numbers of the same operator with what its boundary data do between the particles alone; None: nothing.
 
     Data given by functions are looked at halfway to the nearest particles of the same group, and compared with the
     mean of both. A function that says there what it says at the particle has nothing to tell, nor has an array.
     """
-    disc, zero, told = run.disc, np.zeros_like, whole(run.disc)
-    ways = 2 * (disc.rec.dim - 1)
+    zero, ways, told = np.zeros_like, 2 * (disc.rec.dim - 1), whole(disc)
     if not ways or told.total(sum(not group.linear for group in disc.groups)):
-        return np.zeros(disc.held.shape)
-    cloud = with_corners(run.problem, disc.cloud)
-    here = [np.asarray(x, float) for x in conditions_at(disc, run.problem, cloud)]
+        return None
+    cloud = with_corners(problem, disc.cloud)
+    here = [np.asarray(x, float) for x in conditions_at(disc, problem, cloud)]
     found = [zero(x) for x in here]
     own = np.flatnonzero(disc.n_own)
     for k in range(ways):
         moved, near = _halfway(disc, cloud, k)
-        there = conditions_at(disc, run.problem, moved)
+        there = conditions_at(disc, problem, moved)
         for total, a, b, other in zip(found, here, there, (near, np.searchsorted(own, near[own]), near)):
             total += np.where(a == b, 0.0, b - 0.5 * (a + a[other])) / ways
     if not told.total(sum(int(x.any()) for x in found)):
-        return np.zeros(disc.held.shape)
+        return None
     held, given, gamma = found
-    made = _made_of(run, replace(run.nums, source=zero(run.nums.source), held=held, given=given, gamma=gamma))
-    # A velocity that is zero has no scale to measure what the other's data make of it with.
-    given_in = told.total(held.any(axis=0).astype(int)) > 0
-    return np.where(given_in if given_in.any() else True, made, 0.0)
+    return replace(nums, source=zero(nums.source), held=held, given=given, gamma=gamma)
 
 
 def _halfway(disc: Discretization, cloud: Cloud, k: int) -> tuple[Cloud, np.ndarray]:
@@ -136,7 +212,7 @@ def seam(run: Any, values: Any) -> np.ndarray:
     """
     disc, nums = run.disc, run.nums
     aside = np.flatnonzero(disc.partner != np.arange(len(disc.cloud)))
-    if not len(aside) or disc.linear and disc.traced.constant and disc.traced.source != "variable":
+    if not len(aside) or same_everywhere(disc):
         return np.zeros(disc.held.shape)
     owner, points = disc.partner[aside], np.asarray(disc.cloud.points, float)
     fitted = np.asarray(all_coefficients(disc, nums, values), float)[owner]
@@ -149,7 +225,7 @@ def seam(run: Any, values: Any) -> np.ndarray:
     rows, at = np.array(disc.rec.equation_rows)[:, None], place[owner[known]]
     sides = 1 + np.bincount(at, minlength=len(nums.ids))[at]
     np.add.at(source, (rows, at), (missed[0] - missed[1])[:, known] / sides)
-    return _made_of(run, _with_source(nums, source))
+    return _made_of(run, with_source(nums, source))
 
 
 def _made_of(run: Any, nums: Numbers) -> np.ndarray:
@@ -165,7 +241,12 @@ def _made_of(run: Any, nums: Numbers) -> np.ndarray:
             disc.classes = [replace(cls, scheme=replace(cls.scheme, sourced=True)) for cls in classes]
             classes, rows = all_rows(disc, nums)
         right = right_side(disc, nums, classes, rows)
-    right, found = np.asarray(right), np.zeros(disc.held.shape)
+    return solved_alone(run, np.asarray(right))
+
+
+def solved_alone(run: Any, right: np.ndarray) -> np.ndarray:
+    """The size of what a right-hand side alone makes of the solution of a run, (N, F)."""
+    disc, found = run.disc, np.zeros(run.disc.held.shape)
     solved = run.factor.solve(np.concatenate([right, np.zeros(run.factor.n - len(right))]))
     own = disc.part.own[:, None] if disc.part is not None else True
     found[~disc.held & own] = np.abs(solved[: len(right)])
@@ -184,10 +265,10 @@ def unresolved(disc: Discretization, nums: Numbers, problem: Problem, fitted: np
     source = np.zeros((disc.rec.n_rows, len(nums.ids)))
     for cls in disc.classes:
         source[np.array(disc.rec.equation_rows)[:, None], place[cls.ids]] = _mean(disc, problem, cls, points, fitted)
-    return _with_source(nums, source)
+    return with_source(nums, source)
 
 
-def _with_source(nums: Numbers, source: np.ndarray) -> Numbers:
+def with_source(nums: Numbers, source: np.ndarray) -> Numbers:
     """The numbers of the same operator with this source and no data."""
     zero = np.zeros_like
     return replace(nums, source=source, held=zero(nums.held), given=zero(nums.given), gamma=zero(nums.gamma))

@@ -34,6 +34,7 @@ from jsmitsm.particle.moments import Row
 from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.solution import flags
 from jsmitsm.solution.balance import relative_misfit
+from jsmitsm.solution.regions.between import unseen
 from jsmitsm.solution.regions.flags import singular, weak_copies
 from jsmitsm.solution.run import Run
 
@@ -206,6 +207,8 @@ class RegionsRun(Run):
                 "tell here: compare with a finer cloud."
             )
         cleared = share <= flags.CLEARED
+        if cleared and not certain:
+            told += unseen(self, values)
         return [*certain, *([] if cleared else doubts), *told, *self.against]
 
     @property

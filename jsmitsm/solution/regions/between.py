@@ -1,0 +1,71 @@
+"""What the particles of several regions do not see of their problem, and what it would make of the solution."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from jsmitsm.discretization.coefficients import Numbers
+from jsmitsm.discretization.regions.layout import Part
+from jsmitsm.discretization.regions.rows import RegionNumbers, spread, whole_coefficients, whole_right_side
+from jsmitsm.solution.flags import CLEARED, DATA, MISSED
+from jsmitsm.solution.look.between import (
+    data_between,
+    has_kinks,
+    out_of_series,
+    same_everywhere,
+    solved_alone,
+    unresolved,
+    with_source,
+)
+from jsmitsm.solution.look.sizes import share
+
+
+def unseen(run: Any, values: np.ndarray) -> list[str]:
+    """A sentence for what lies between the particles of the regions, and for each that orders do not see."""
+    expanded = np.asarray(whole_coefficients(run.disc, run.nums, values), float)
+
+    def left(part: Part, own: Numbers) -> Numbers | None:
+        disc = part.disc
+        return None if same_everywhere(disc) else unresolved(disc, own, disc.problem, expanded[part.ids])
+
+    def beyond(part: Part, own: Numbers) -> Numbers | None:
+        disc = part.disc
+        return out_of_series(disc, own, disc.problem, expanded[part.ids]) if has_kinks(disc) else None
+
+    told = []
+    if (missed := share(_made(run, left), values)) > MISSED:
+        told.append(
+            f"Between the particles the equations are missed by as much as makes {missed:.0%} of the solution: a "
+            "source or a coefficient changes within the spacing, unseen by the particles; refine there, or smooth it."
+        )
+    if (kinks := share(_made(run, beyond), values)) > CLEARED:
+        told.append(
+            f"Beyond kinks or jumps of a source or a coefficient, where their series end, the equations are missed by "
+            f"as much as makes {kinks:.0%} of the solution: make both sides regions of their own, or refine there."
+        )
+    if (data := share(_made(run, _data), values)) > DATA:
+        told.append(
+            f"Between the particles boundary data change by as much as makes {data:.0%} of the solution, unseen by "
+            "them: refine the boundary, or smooth the data."
+        )
+    return told
+
+
+def _data(part: Part, own: Numbers) -> Numbers | None:
+    return data_between(part.disc, own, part.disc.problem)
+
+
+def _made(run: Any, look: Callable[[Part, Numbers], Numbers | None]) -> np.ndarray:
+    """What the numbers that ``look`` finds in every region, None for nothing, make of the solution, (N, F)."""
+    disc, nums = run.disc, run.nums
+    found = [look(part, own) for part, own in zip(disc.parts, nums.parts)]
+    if all(own is None for own in found) or run.factor is None:
+        return np.zeros(disc.held.shape)
+    alone = [with_source(own, np.zeros_like(own.source)) if new is None else new for own, new in zip(nums.parts, found)]
+    between = {name: (coef, np.zeros_like(value)) for name, (coef, value) in nums.between.items()}
+    held = spread(disc, [own.held for own in alone], disc.held.shape)
+    right = whole_right_side(disc, RegionNumbers(alone, between, held), run.parts, run.bound)
+    return solved_alone(run, np.asarray(right))
