@@ -96,6 +96,12 @@ def test_classes_have_an_example_and_no_description_is_empty(entries):
             assert "&gt;&gt;&gt;" in entries[f"jsmitsm.{name}"], name
     empty = [name for name, entry in entries.items() if re.search(r"–\s*</p>|–\s*</li>|–\s*</div>", entry)]
     assert not empty, empty
+    # Words after a list of errors are taken for errors: they belong under "Notes".
+    for name, entry in entries.items():
+        raised = entry.partition("Raises:")[2].partition("Examples:")[0].partition("</ul>")[0]
+        for item in re.findall(r"<li[^>]*>(.*?)</li>", raised, re.S):
+            said = " ".join(re.sub(r"<[^>]+>", "", item).split())
+            assert re.match(r"[\w.]+ –", said), f"{name}: {said}"
 
 
 def test_nothing_is_raw_and_nothing_comes_from_another_host(site):

@@ -17,7 +17,7 @@ import jsmitsm as js
 def flow(stream, x, reynolds):
     vorticity = lambda y: -js.laplacian(stream)(y)
     (down, along), slope = js.grad(stream)(x), js.grad(vorticity)(x)
-    carried = along * slope[0] - down * slope[1]  # the velocity is (along, -down)
+    carried = along * slope[0] - down * slope[1]  # by (along, -down)
     return reynolds * carried - js.laplacian(vorticity)(x)
 
 
@@ -35,5 +35,5 @@ grid = np.stack(np.meshgrid(x, x), axis=-1).reshape(-1, 2)
 stream = sol(grid).reshape(101, 101)
 ax = js.plot.solution(sol)
 levels = np.linspace(-0.1, -0.005, 15)
-ax.contour(x, x, stream, levels, colors="black", linewidths=0.7, linestyles="solid")
+ax.contour(x, x, stream, levels, colors="black", linestyles="solid")
 plt.show()

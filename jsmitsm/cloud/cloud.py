@@ -77,6 +77,8 @@ class Cloud:
     ValueError
         For a wrong shape, NaN, overlapping or incomplete groups, duplicate particles.
 
+    Notes
+    -----
     A cloud is a pytree: points and normals are leaves, groups and cell groups are static. It does not change: its
     arrays are read-only copies, and ``replace`` makes another one.
 

@@ -63,6 +63,8 @@ def from_sdf(
         the spacing is too coarse for the shape; if a predicate returns something else than (M,) booleans, claims
         nothing, or some particle is claimed by none.
 
+    Notes
+    -----
     The boundary is found by marching triangles on an octree refined to the spacing and projected with Newton's
     method. The interior is a lattice, a little disordered, relaxed near the boundary by short-range repulsion; where
     the spacing varies it is filled by dithering and relaxed everywhere (in the spirit of Fornberg and Flyer, Comput.

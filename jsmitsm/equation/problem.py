@@ -28,7 +28,7 @@ class Problem:
     ----------
     pde : function
         Function ``(u, x)`` or ``(u, x, params)`` returning the residual at the point x (D,): a scalar, or (F,) for
-        a system. ``u`` is a local field, see ``jsmitsm.equation.operators``. For a cloud of several regions
+        a system. ``u`` is a local field, see ``js.grad``. For a cloud of several regions
         (``js.regions``) a dict of them, one for each region by its name.
     bcs : mapping
         Maps each boundary group to a condition, or to a list of them where the operator's order or the number of
