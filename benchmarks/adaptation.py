@@ -121,7 +121,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=DATA)
     parser.add_argument("--only", choices=["elements", "particles"])
     given = parser.parse_args()
-    print(f"Left out, for they need several materials: {', '.join(LEFT_OUT)}.")
+    print(f"Left out: {', '.join(LEFT_OUT)}.")
     if not elements.available():
         print("No finite elements: NGSolve is not installed (pip install ngsolve).")
     print(

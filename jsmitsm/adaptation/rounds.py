@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 
 from jsmitsm.adaptation.data import Data, data_of, unresolved
+from jsmitsm.adaptation.edges import edges
 from jsmitsm.adaptation.first_cloud import Make, made
 from jsmitsm.adaptation.layers import layers
-from jsmitsm.adaptation.marking import ROUGH, Marks, marks, next_spacing
+from jsmitsm.adaptation.marking import ROUGH, SLOW, Marks, marks, next_spacing
 from jsmitsm.adaptation.measure import Measured, Quantity, gaps, measured, size
 from jsmitsm.adaptation.spacing_field import SpacingField
 from jsmitsm.cloud.cloud import Cloud
@@ -31,9 +32,9 @@ _LADDER = {
 _HOPE = 0.5
 # Polynomials of neighbours may differ between them by so many tolerances: they are off by so much more than the values.
 _GAP = 10.0
-# Where contributions fall with less than this power of the spacing, solutions of two orders miss the same, and are
-# nearer to each other than to what is true: the distance is taken for that part of the error.
-_SLOW, _ALIKE = 2.0, 0.5
+# Where smoothness ends solutions of two orders miss the same, and are nearer to each other than to what is true: the
+# distance is taken for this part of the error.
+_ALIKE = 0.5
 # The numbers of two rounds may differ by so many times what the first was thought to be off by.
 _AGREE = 3.0
 # Where they part, at a corner most often, that falls with this power of the spacing.
@@ -67,6 +68,7 @@ class Rounds:
         self.clock = began
         self.solution: Solution = None  # type: ignore[assignment]
         self.error, self.reached = np.inf, False
+        self.undoubted = np.inf  # the error without the doubt where smoothness ends, which marking has as well
         self.number: float | None = None
         self.number_before: float | None = None
         self.flags: list[str] = []
@@ -136,7 +138,7 @@ class Rounds:
         now = time.perf_counter()
         self.rows.append((len(cloud), order, found.error, now - self.clock, float(h.min())))
         self.clock = now
-        self.solution, self.error = sol, found.error
+        self.solution, self.error, self.undoubted = sol, found.error, found.error
         self.number_before, self.number = self.number, found.number
         return sol, found
 
@@ -219,7 +221,8 @@ class Rounds:
                 self.apart = apart
             else:
                 self.error = max(self.error, between)
-        self.error = max(self.error, self._doubted(found, cloud, spacing), self._disagreed())
+        self.undoubted = max(self.error, self._disagreed())
+        self.error = max(self.undoubted, self._doubted(found, cloud, spacing))
         self.reached = self.error <= self.tol and not self.flags and self.apart is None
         return self.reached
 
@@ -227,7 +230,7 @@ class Rounds:
         """The error where smoothness ends, of which the estimate sees a part."""
         if found.local is None or self.before is None:
             return 0.0
-        slow = self._marks(found, cloud, spacing).rate < _SLOW
+        slow = self._marks(found, cloud, spacing).rate < SLOW
         return float(found.local[slow].max(initial=0.0)) / _ALIKE
 
     def _disagreed(self) -> float:
@@ -274,7 +277,7 @@ class Rounds:
 
     def _next(self, found: Measured, cloud: Cloud, spacing: SpacingField) -> tuple[SpacingField, Cloud] | None:
         points, h = np.asarray(cloud.points), spacing(np.asarray(cloud.points))
-        power, error = self._power(cloud), self.error if np.isfinite(self.error) else 1e3
+        power, error = self._power(cloud), self.undoubted if np.isfinite(self.undoubted) else 1e3
         apart, self.apart = self.apart, None
         here = self._marks(found, cloud, spacing)
         self.before = here if np.isfinite(found.error) else None
@@ -282,10 +285,10 @@ class Rounds:
             self._limit(f"the {self.max_particles} particles that were allowed (max_particles)")
             return None
         most = min(max(_GROWTH * len(cloud), _SMALL[cloud.dim]), self.max_particles)
-        wanted = _EASED * self.tol if apart is not None else self.tol if error > self.tol else 0.5 * error
+        wanted = _EASED * self.tol if apart is not None else self.tol if self.error > self.tol else 0.5 * error
         made_h, _ = next_spacing(here, power, error, wanted, most, found.gathered)
         if apart is not None:
-            parted = marks(points, h, apart, power, None, _PARTED)
+            parted = marks(points, h, apart, power, None, expected=_PARTED)
             finer, _ = next_spacing(parted, power, float(apart.max()) / found.scale / _GAP, self.tol, most)
             made_h = np.where(finer < h, np.minimum(made_h, finer), made_h)
         field = SpacingField(points, made_h, spacing.largest)
@@ -318,9 +321,10 @@ class Rounds:
         return self.solution.order + 1.0 + min(0, cloud.dim - self._operator_order(self.solution))
 
     def _marks(self, found: Measured, cloud: Cloud, spacing: SpacingField) -> Marks:
-        trusted = len(self.rows) > 1 and np.isfinite(found.error)
-        points, before = np.asarray(cloud.points), self.before if trusted else None
-        return marks(points, spacing(points), found.contribution, self._power(cloud), before)
+        # Contributions at another order are others, in a constant at least: they tell no rate.
+        comparable = len(self.rows) > 1 and self.rows[-1][1] == self.rows[-2][1] and np.isfinite(found.error)
+        points, before = np.asarray(cloud.points), self.before if comparable else None
+        return marks(points, spacing(points), found.contribution, self._power(cloud), before, edges(cloud))
 
     def _better(self, spacing: SpacingField) -> SpacingField | None:
         """The spacing of a round before that did better than the last one, over which no other may grow then."""

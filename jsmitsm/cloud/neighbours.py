@@ -221,6 +221,11 @@ def kept_distances(points: np.ndarray, centres: np.ndarray) -> np.ndarray:
     return distance[:, 1] / np.where(spacing > 0, spacing, 1.0)
 
 
+def reaches(points: np.ndarray, centres: np.ndarray, size: int) -> np.ndarray:
+    """The distance within which every centre (n, D) has ``size`` of the points, or all of fewer."""
+    return _query(_searcher(points), centres, min(size, len(points)))[0][:, -1]
+
+
 def is_even(kept: np.ndarray) -> bool:
     """Whether such distances of a sample are those of an even cloud."""
     return bool(np.sort(kept)[len(kept) // 10] > _EVEN)

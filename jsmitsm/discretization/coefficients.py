@@ -67,13 +67,28 @@ def numbers(disc: Discretization, problem: Problem, taylor: Any = None, everywhe
     ids = np.arange(len(disc.cloud)) if everywhere else disc.active
     here = None if taylor is None else picked(taylor, ids)
     jac, source = operator_numbers(disc, problem, picked(disc.cloud.points, ids), here)
-    if disc.rec.depth and disc.linear and disc.traced.source == "variable" and disc.traced.kinked_source:
-        values = -disc.traced.residuals(disc.cloud.points, params=problem.params)
-        source = softened(disc, ids, source, values)
+    if disc.rec.depth and disc.linear and disc.traced.source == "variable":
+        source = _softened(disc, problem, ids, source)
     held = _held_values(disc)
     own_ids, own, given = _own_numbers(disc, held, taylor)
     data, gamma = _data_numbers(disc, taylor)
     return settled(disc, problem, Numbers(ids, jac, source, own_ids, own, given, _at(disc, held), data, gamma))
+
+
+def _softened(disc: Discretization, problem: Problem, ids: np.ndarray, source: Any) -> Any:
+    """The source's series without those that mislead, beside kinks and around points where a source is infinite."""
+    if not (disc.traced.kinked_source or disc.traced.unbounded_source):
+        return source
+    at = lambda x: -disc.traced.residuals(x, params=problem.params)
+    points, values = disc.cloud.points, at(disc.cloud.points)
+    if not is_traced(values):
+        seen = disc.traced.kinked_source or not np.isfinite(values).all()
+        return softened(disc, ids, source, values) if seen else source
+    finite = jnp.isfinite(values).all(axis=0)
+    # Derivatives of what is infinite are not asked for: times nothing they would not be nothing.
+    values = jnp.where(finite, at(jnp.where(finite[:, None], points, points[ids[0]])), jnp.nan)
+    new = softened(disc, ids, source, values)
+    return new if disc.traced.kinked_source else jnp.where(finite.all(), source, new)
 
 
 def conditions_of(disc: Discretization, problem: Problem) -> tuple[Any, Any, Any]:

@@ -25,6 +25,8 @@ LEBESGUE = 1.5
 HOPELESS = 10.0
 # Beyond this a stencil that could not be repaired has a weight that falls less.
 POOR = 3.0
+# A stencil is better by more than rounding: the same neighbours in another order are no repair.
+GAIN = 1e-6
 # A moment system that misses what is asked of it by more than this does not determine it.
 DEFECT = 1e-6
 
@@ -225,7 +227,7 @@ class _Best:
     def update(self, at: np.ndarray, neighbours: np.ndarray, row: Row) -> None:
         """Take over the rows of ``at`` that came out healthier."""
         score = _score(row)
-        gain = score < self.lebesgue[at]
+        gain = score < (1.0 - GAIN) * self.lebesgue[at]
         if self.one_sided:
             gain &= (score <= LEBESGUE) | (self.lebesgue[at] > HOPELESS)
         better = np.flatnonzero(gain)

@@ -124,16 +124,16 @@ def discretize(
     kernel = kernel and kernel.recorded()
     traced = _traced(problem, cloud.dim)
     _check_operator(traced, problem, order)
-    problem = closed(problem, traced)
-    kernel, stencils = jax.tree.map(owned, (kernel, stencils))
+    problem, (kernel, stencils) = closed(problem, traced), jax.tree.map(owned, (kernel, stencils))
     sourced = sources or not traced.linear or traced.source != "zero"
     rec = recursion(cloud.dim, order, problem.fields, traced.slots, traced.pattern, traced.order)
     flat = traced.constant and rec.scale_free
+    groups = group_conditions(problem, with_corners(problem, cloud), order, traced.order, part is None)
     if depth == "auto":
-        depth = suited_depth(method, rec, flat, sourced)
+        held = [g.ids for g in groups if g.held]
+        depth = suited_depth(method, rec, flat, sourced, traced, cloud, problem.params, held, part)
         depth = depth and min(depth, room(rec, order, traced, cloud, problem.params, part))
     rec = recursion(cloud.dim, order, problem.fields, traced.slots, traced.pattern, traced.order, int(depth))
-    groups = group_conditions(problem, with_corners(problem, cloud), order, traced.order, part is None)
     scheme = _scheme(method, rec, traced, problem, cloud, basis_terms)
     scheme = replace(scheme, **_conditions_layout(groups, rec), sourced=sourced, flat=flat)
     if scheme.n_data and method in ("I", "II", "III"):

@@ -55,7 +55,7 @@ def _closed_condition(problem: Problem, c: Condition, dim: int, where: str) -> C
 
 def recorded_values(function: Callable[..., Any], dim: int, params: Any, components: int, where: str) -> Traced:
     arguments = "x" if params is None else "x, params"
-    with _named(where, f"a function of {arguments} that returns a scalar"):
+    with _named(where, f"a function of {arguments} that returns {_wanted(components)}"):
         # Without the condition's name: a function on several sides is recorded once.
         return trace(lambda u, x, *p: _shaped(function(x, *p), components), dim, components, params=params)
 
@@ -106,4 +106,10 @@ def _shaped(result: Any, components: int) -> Any:
         return result.reshape((components,) if components > 1 else ())
     if result.ndim == 0:
         return jnp.full((components,), result)
-    raise _NoValue(f"expected a function of one point x (D,) returning a scalar, got shape {result.shape}")
+    raise _NoValue(
+        f"expected a function of one point x (D,) returning {_wanted(components)}, got shape {result.shape}"
+    )
+
+
+def _wanted(components: int) -> str:
+    return "a scalar" if components == 1 else f"({components},), one number per field, or a scalar for all"

@@ -32,6 +32,8 @@ CHUNK, LEAST = 60_000, 512
 COMPILATIONS = 0
 # Operations on floats whose slope may jump, beside those whose outcomes choose or look up something.
 KINKS = frozenset("abs max min clamp reduce_max reduce_min cummax cummin sort".split())
+# Operations that may be infinite at a point; powers of whole numbers are, where these are negative.
+POLES = frozenset("div pow log log1p rsqrt tan lgamma digamma".split())
 
 
 @jax.tree_util.register_pytree_node_class
@@ -172,9 +174,17 @@ class Traced:
     @cached_property
     def _kinks(self) -> tuple[bool, bool]:
         """Whether the source may have kinks or jumps, and whether the coefficients may."""
-        needed = lambda jac: levels(self._record.jaxpr, self._wanted(jac, not jac))  # noqa: E731
-        source, operator = (any(_kinked(eqn) for eqn, _ in needed(jac)) for jac in (False, True))
+        source, operator = (any(_kinked(eqn) for eqn in self._needed(jac)) for jac in (False, True))
         return source, operator
+
+    @cached_property
+    def unbounded_source(self) -> bool:
+        """Whether the source may be infinite somewhere."""
+        return any(_unbounded(eqn) for eqn in self._needed(False))
+
+    def _needed(self, jac: bool) -> list[Any]:
+        """The operations that the coefficients, or the source, are made by."""
+        return [eqn for eqn, _ in levels(self._record.jaxpr, self._wanted(jac, not jac))]
 
     def with_any_numbers(self) -> Traced:
         """The same with some numbers for the constants that are only traced."""
@@ -370,6 +380,12 @@ class _Inputs:
 def _kinked(eqn: Any) -> bool:
     own = eqn.primitive.name in KINKS or decides(eqn)
     return own or any(_kinked(e) for inner in inner_jaxprs(eqn) for e in inner.eqns)
+
+
+def _unbounded(eqn: Any) -> bool:
+    name = eqn.primitive.name
+    own = name in POLES or name == "integer_pow" and eqn.params["y"] < 0
+    return own or any(_unbounded(e) for inner in inner_jaxprs(eqn) for e in inner.eqns)
 
 
 def _zeros(value: Any) -> np.ndarray:

@@ -39,5 +39,5 @@ def error_estimate(sol: ParallelSolution | ParallelModes) -> np.ndarray:
     """
     if isinstance(sol, ParallelModes):
         return errors(sol)
-    error = np.abs(sol._corrected())
+    error = sol._corrected()
     return error[:, 0] if sol._recipe.fields == 1 else error

@@ -21,6 +21,7 @@ from jsmitsm.parallel.team import Team, team
 from jsmitsm.particle.kernels import Kernel
 from jsmitsm.runtime.arrays import ValueOrFunction
 from jsmitsm.runtime.errors import did_you_mean, explaining
+from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.solution.arguments import Depth, check
 from jsmitsm.solution.fit import Recipe
 
@@ -136,6 +137,7 @@ def refuse_others(problem: Any, cloud: Any, method: Any, form: Any, solver: Any)
     if isinstance(problem.pde, PerRegion):
         raise ValueError("problem: several regions are not made for several processes; use js.solve")
     refuse_extras(problem)
+    refuse_traced(problem.params, getattr(cloud, "points", None))
     for value, known, name in ((method, ("S", "III"), "method"), (form, ("auto", "loo"), "formulation"),
                                (solver, SOLVERS, "solver")):  # fmt: skip
         if value not in known:
@@ -144,3 +146,12 @@ def refuse_others(problem: Any, cloud: Any, method: Any, form: Any, solver: Any)
     ways(solver, True)
     if getattr(cloud, "dim", 2) == 1:
         raise ValueError("cloud: one in 1D has no need of several processes; use js.solve")
+
+
+def refuse_traced(*given: Any) -> None:
+    """Refuse what a JAX transform traces: it sees one process alone."""
+    if is_traced(given):
+        raise ValueError(
+            "problem: traced by a JAX transform, which cannot follow several processes; jp.value_and_grad has "
+            "gradients of steady linear problems, js.solve and js.evolve those of all others"
+        )

@@ -9,6 +9,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.interpreters import partial_eval
 
 # What jaxprs are made of, for the whole package. JAX's public place for it, jax.extend.core, is these very objects, and
 # loads Pallas with them: most of what importing this package would take.
@@ -104,6 +105,11 @@ def inner_jaxprs(eqn: Any) -> list[Jaxpr]:
     for value in eqn.params.values():
         look(value)
     return found
+
+
+def used_inputs(jaxpr: Jaxpr) -> list[bool]:
+    """Of every input whether an output depends on it."""
+    return list(partial_eval.dce_jaxpr(jaxpr, [True] * len(jaxpr.outvars))[1])
 
 
 def levels(jaxpr: Any, wanted: Sequence[int]) -> tuple[tuple[Any, int], ...]:

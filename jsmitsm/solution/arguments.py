@@ -25,7 +25,7 @@ Formulation: TypeAlias = Literal["auto", "loo", "lsq"]
 Depth: TypeAlias = int | Literal["auto"]
 """What ``depth`` may be, a type for annotations."""
 METHODS, FORMULATIONS = get_args(Method), get_args(Formulation)
-# Beyond so many degrees round-off of the extension outweighs its gain.
+# Local polynomials end so many degrees beyond the highest order.
 DEEPEST = 4
 
 
@@ -111,7 +111,7 @@ def _check_depth(depth: Any, method: str, order: Any) -> None:
     if order + depth > HIGHEST + DEEPEST:
         raise ValueError(
             f"depth: order {order} and depth {depth} make polynomials of degree {order + depth}, and "
-            f"{HIGHEST + DEEPEST} is the highest; beyond depth {DEEPEST} nothing is gained"
+            f"{HIGHEST + DEEPEST} is the highest; more than 4 pay for coarse waves alone, and 6 have all of the gain"
         )
 
 

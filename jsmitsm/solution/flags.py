@@ -360,7 +360,7 @@ def _far_away(run: Any, values: np.ndarray, nums: Any, out: list[str], found: di
     told = whole(run.disc)
     if not run.rows or not told.most(len(run.rows[1])):
         return
-    dtype = np.asarray(run.rows[1][0].weights).dtype if run.rows[1] else np.dtype(float)
+    dtype: Any = np.asarray(run.rows[1][0].weights).dtype if run.rows[1] else np.dtype(float)
     far = told.most(float(np.abs(np.asarray(run.disc.cloud.points)).max()))
     found["rounded"] = float(np.finfo(dtype).eps) * far / (mean_spacing(run.disc) or far or 1.0)
     if found["rounded"] > ROUNDED:

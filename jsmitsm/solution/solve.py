@@ -77,7 +77,8 @@ def solve(
         Degrees by which the recursion goes beyond the order: the local polynomials have degree order + depth, with
         no more free coefficients. 0 is the paper's. "auto" is, for method S, 4 in 1D and 2D (2 at order 2), in 3D
         2, or 4 where the operator is constant and of one order; for I, II and III 0. SSPH has no recursion to go
-        deeper with.
+        deeper with. The data have a word in it where the problem is linear: in 2D it is 2 where coefficients and
+        source hardly turn within a support, and 6 from order 6 on where a constant operator or its source oscillates.
     kernel : Kernel, optional
         Weights and supports; chosen from the cloud, the order and the method if not given.
     stencils : Stencils, optional

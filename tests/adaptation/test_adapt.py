@@ -7,6 +7,7 @@ import pytest
 
 import jsmitsm as js
 from jsmitsm.adaptation.data import data_of, unresolved
+from jsmitsm.adaptation.edges import edges
 from jsmitsm.adaptation.first_cloud import first_cloud
 from jsmitsm.adaptation.layers import layers
 from jsmitsm.adaptation.marking import Marks, marks, next_spacing
@@ -204,21 +205,21 @@ def test_contributions_are_made_equal():
 def test_near_the_tolerance_no_spacing_grows():
     """What was coarsened there had to be refined again, round after round; but for what is no matter at all."""
     points = np.linspace(0.0, 1.0, 100)[:, None]
-    found = marked(points, np.where(np.arange(100) < 50, 1.0, 1e-2))
+    found = marked(points, np.where(np.arange(100) < 50, 1.0, 1e-3))
     assert next_spacing(found, 5.0, 5e-3, 2e-3, 100_000)[0].max() == pytest.approx(0.01)
-    assert next_spacing(found, 5.0, 1e-1, 2e-2, 100_000)[0].max() > 0.013
+    assert next_spacing(found, 5.0, 2.5e-1, 2e-2, 100_000)[0].max() > 0.013
     found = marked(points, np.where(np.arange(100) < 50, 1.0, 1e-9))
     assert next_spacing(found, 5.0, 5e-3, 2e-3, 100_000)[0].max() > 0.013
 
 
 def test_a_singular_point_found_twice_is_refined_by_far():
     """Contributions h^(2/3) about 0, on spacings that grow from it; those beside it are left to the gradation."""
-    away = np.cumsum(0.1 * 1.1 ** np.arange(40))
-    points = np.concatenate([-away[::-1], [0.0], away])[:, None] + 1e-3
 
     def round_of(tip, before):
-        eta = np.where(np.abs(points[:, 0]) < 0.05, tip ** (2 / 3), 1e-9)
-        return marks(points, tip + np.abs(points[:, 0] - 1e-3) / 4, eta, 9.0, before)
+        away = tip * (1.25 ** np.arange(1, 41) - 1.0) / 0.25
+        points = np.concatenate([-away[::-1], [0.0], away])[:, None]
+        eta = np.where(np.abs(points[:, 0]) < 0.5 * tip, tip ** (2 / 3), 1e-9)
+        return marks(points, tip + np.abs(points[:, 0]) / 4, eta, 9.0, before)
 
     first = round_of(0.1, None)
     assert not first.singular.any()  # nobody knows a rate yet
@@ -228,6 +229,32 @@ def test_a_singular_point_found_twice_is_refined_by_far():
     assert np.flatnonzero(third.located).tolist() == [40]
     made, _ = next_spacing(third, 9.0, 1e-2, 1e-7, 100_000)
     assert made[40] < 0.05 * third.spacing[40]
+
+
+def test_a_singular_point_beside_an_edge_is_the_edge():
+    """The worst particle is beside the corner, and so is the largest mean; smoothness ends where the boundary turns."""
+    cloud = js.from_polygon(CORNER, 0.1)
+    points, edge = np.asarray(cloud.points), edges(cloud)
+    assert len(cloud.boundary[edge[cloud.boundary]]) == 6
+    assert np.linalg.norm(points[edge][:, None] - np.array(CORNER, float), axis=2).min(axis=1).max() < 1e-12
+    beside = int(np.argmin(np.linalg.norm(points - [-0.05, 0.07], axis=1)))
+    eta = np.exp(-np.linalg.norm(points - points[beside], axis=1) / 0.1)
+    first = marks(points, np.full(len(points), 0.1), eta, 5.0, None, edge)
+    found = marks(points, np.full(len(points), 0.07), 0.9 * eta, 5.0, first, edge)
+    assert found.singular.sum() == 1 and np.linalg.norm(points[found.singular][0]) < 1e-12
+    assert marks(points, np.full(len(points), 0.07), 0.9 * eta, 5.0, first).singular[beside]
+
+
+def test_rounds_of_two_orders_tell_no_rates():
+    """Contributions that only fell by half as the order grew are not those of a point where smoothness ends."""
+    search, cloud = a_search(), js.interval(0.0, 1.0, 101)
+    search.solution = js.solve(GOOD, cloud, order=4)
+    x, none = np.asarray(cloud.points), np.zeros(101, bool)
+    found, field = Measured(3e-4, np.full(101, 0.5), 1.0), SpacingField(x, np.full(101, 0.01), 0.01)
+    search.before = Marks(x, np.full(101, 0.02), np.ones(101), np.full(101, 5.0), none, none)
+    for orders, rate in (((4, 4), 1.0), ((2, 4), search._power(cloud))):
+        search.rows = [(101, order, 1e-2, 0.0, 0.02) for order in orders]
+        assert np.median(search._marks(found, cloud, field).rate) == pytest.approx(rate)
 
 
 def test_rounds_do_not_undo_each_other():

@@ -7,6 +7,8 @@ import pytest
 
 import jsmitsm as js
 from jsmitsm import sdf
+from jsmitsm.cloud import contour, filling, levelset
+from jsmitsm.cloud.packing.graded import blocks, graded_part, owners
 from jsmitsm.cloud.packing.octree import morton
 from jsmitsm.cloud.packing.relaxation import thin
 from jsmitsm.cloud.sdf import recorded
@@ -93,3 +95,23 @@ def test_a_thinned_set_is_apart_and_maximal(radii):
     np.fill_diagonal(close, False)
     assert not close[np.ix_(kept, kept)].any()
     assert close[:, kept].any(axis=1)[np.setdiff1d(np.arange(900), kept)].all()
+
+
+def test_graded_parts_are_the_whole():
+    """Of 13,000 particles, five times as near at the rim of a plate, three parts have each its own."""
+    lo, hi = np.zeros(2), np.array([2.0, 1.0])
+    spacing = filling.spacing_function(lambda x: 0.005 + 0.016 * np.hypot(x[:, 0] - 1.8, x[:, 1] - 0.5))
+    region = levelset.SdfRegion(PLATE, lo, hi)
+    rim = levelset.checked(region, contour.contour(region, spacing)).points
+    grid = blocks(region, spacing, lo, hi)
+    fill = lambda mine: graded_part(region, spacing, lo, hi, rim, 0, grid, mine)  # noqa: E731
+    whole, of = fill(np.ones(len(grid.share), bool)), owners(grid, 3)
+    parts = [fill(of == k) for k in range(3)]
+    assert len(whole) == pytest.approx(grid.share.sum(), rel=0.03)
+    assert max(map(len, parts)) < 1.1 * min(map(len, parts))
+    together = np.concatenate(parts)
+    np.testing.assert_array_equal(together[np.lexsort(together.T)], whole[np.lexsort(whole.T)])
+    # As near as those that one process fills: 0.79 of the spacing at the least.
+    every = np.concatenate([whole, rim])
+    gap = np.sort(np.linalg.norm(every[None, :400] - every[:, None], axis=2), axis=0)[1]
+    assert (gap > 0.75 * spacing(every[:400])).all()

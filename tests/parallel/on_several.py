@@ -101,6 +101,13 @@ def plain():
     return js.Problem(lambda u, x: js.laplacian(u)(x) + jnp.exp(x[0]), {name: js.dirichlet(exact) for name in SIDES})
 
 
+def narrow():
+    """A source between the particles, of which flags tell; of the form of ``plain``, whose programs serve."""
+    peak = lambda x: jnp.exp(-((x[0] - 0.5) ** 2 + (x[1] - 0.47) ** 2) / 1e-3)  # noqa: E731
+    held = {name: js.dirichlet(lambda x: 0.0 * x[0]) for name in SIDES}
+    return js.Problem(lambda u, x: js.laplacian(u)(x) + peak(x), held)
+
+
 def small():
     return js.rectangle((0, 0), (1, 1), (12, 12), jitter=0.2)
 
@@ -157,7 +164,12 @@ def _mixed():
 
 def _plain():
     one = js.solve(plain(), small(), **CHEAP)
-    return {"u": one.u, "error": one.error_estimate()}
+    return {"u": one.u, "error": one.error_estimate(), "flags": np.array(one.flags, str)}
+
+
+def _narrow():
+    one = js.solve(narrow(), small(), **CHEAP)
+    return {"u": one.u, "flags": np.array(one.flags, str)}
 
 
 def _graded():
@@ -206,7 +218,8 @@ def _drum():
 
 MOVED = ((66, 0), (78, 1))
 ALONE = {
-    "mixed": _mixed, "plain": _plain, "graded": _graded, "quasilinear": _quasilinear, "params": _of_params,
+    "mixed": _mixed, "plain": _plain, "narrow": _narrow, "graded": _graded, "quasilinear": _quasilinear,
+    "params": _of_params,
     "system": lambda: {"u": js.solve(*system(), **CHEAP).u}, "cube": lambda: {"u": js.solve(*cube(), **CHEAP).u},
     "III": lambda: {"u": js.solve(*mixed(), method="III", **CHEAP).u},
     "kernel": lambda: {"u": js.solve(*graded(), **weighted_kernel(graded()[1])).u},
@@ -281,8 +294,7 @@ def always(found, one):
         mine, whole = (x[np.lexsort(x.T)] for x in (np.concatenate(inside), filled_by_one()))
         found["filled"] = float(np.abs(mine - whole).max()) if len(mine) == len(whole) else -1.0
 
-
-    # Graded, and so made by the first process.
+    # Graded, of few particles, and so made by the first process.
     spacing = lambda x: 0.05 + 0.1 * x[:, 0]  # noqa: E731
     slab = jp.cloud_from(js.from_sdf, shape(), ((0, 0), (1, 1.5)), spacing)
     if COMM.rank == 0:
@@ -328,6 +340,8 @@ def once(found, one):
     sol = jp.solve(plain(), small(), **CHEAP)
     error = jp.error_estimate(sol)
     found["estimate"] = jp.norm(error - one["plain"]["error"][sol.numbers]) / jp.norm(error)
+    rough = jp.solve(narrow(), small(), **CHEAP)
+    found["steady flags"] = [[s.flags, one[name]["flags"].tolist()] for s, name in ((sol, "plain"), (rough, "narrow"))]
     found["III"] = off(jp.solve(problem, cloud, method="III", **CHEAP), one["III"])
     problem, cloud = graded()
     found["kernel"] = off(jp.solve(problem, cloud, **weighted_kernel(cloud)), one["kernel"])
@@ -377,6 +391,11 @@ def _refused(cloud):
         "in time": refused(lambda: jp.evolve(
             js.Problem(lambda u, x, t: js.dt(u)(x) - lap(u, x), zero), cloud, 0.0, (0.0, 1.0), steps=2,
             scheme="radau")),
+        "by start": refused(lambda: jax.grad(lambda k: jp.evolve(
+            js.Problem(lambda u, x, t: js.dt(u)(x) - lap(u, x), zero), cloud, lambda x: k * x[0], (0.0, 1.0), steps=2
+        ).u.sum())(1.0)),
+        "by params": refused(lambda: jax.grad(lambda k: jp.solve(
+            js.Problem(lambda u, x, k: k * lap(u, x), zero, params=k), cloud, **CHEAP).u.sum())(1.0)),
         "a line": refused(lambda: jp.cloud_from(js.interval, 0.0, 1.0, 9)),
         "II": refused(lambda: jp.solve(js.Problem(lap, zero), cloud, method="II")),
         "periodic": refused(lambda: jp.solve(js.Problem(lap, pair), cloud)),

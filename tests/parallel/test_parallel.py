@@ -97,6 +97,12 @@ def test_the_estimate_is_that_of_one_process(of_two):
     assert of_two["estimate"] < 1e-8
 
 
+def test_flags_are_those_of_one_process(of_two):
+    (healthy, alone), (told, same) = of_two["steady flags"]
+    assert healthy == alone == []
+    assert told == same and len(told) > 1
+
+
 def test_newton_takes_the_steps_of_one_process(of_two):
     assert of_two["newton"] < 1e-11
     assert of_two["steps"][0] == of_two["steps"][1] > 3
@@ -182,7 +188,7 @@ def test_hdf5(found):
         ("floating", "nothing fixes"), ("nonlinear", "nonlinear"), ("II", "'II' is none of"),
         ("periodic", "js.periodic is not made"), ("in time", "'radau' is none of"), ("a line", "in 1D"),
         ("first order", "information travels"), ("one process", "on process 0"), ("array", "shape (3,)"),
-        ("mass", "write the operator"),
+        ("mass", "write the operator"), ("by params", "JAX transform"), ("by start", "JAX transform"),
     ],
 )  # fmt: skip
 def test_what_is_not_made_is_refused_in_words(of_two, what, words):

@@ -29,9 +29,9 @@ def test_clouds_problems_solutions_and_evolutions():
     assert "9.8" in modes._repr_html_() and "error" not in modes._repr_html_() and "<circle" in modes._repr_html_()
     modes.error_estimate()
     assert modes._repr_html_().count(", error ") == 2
-    found = js.adapt(problem, lambda h: js.interval(0.0, 1.0, spacing=h), 1e-3, order=2, progress=False)
+    found = js.adapt(problem, lambda h: js.interval(0.0, 1.0, spacing=h), 1e-3, order=2, depth=0, progress=False)
     assert "0.001 asked for" in found._repr_html_() and "<b>Solution</b>" in found._repr_html_()
-    best = js.tune(problem, ROD, js.SuperGaussian(0.25, 2.0), order=2, steps=2, progress=False)
+    best = js.tune(problem, ROD, js.SuperGaussian(0.25, 2.0), method="SSPH", order=2, steps=2, progress=False)
     assert "SuperGaussian" in best._repr_html_() and "objective" in best._repr_html_()
     shells = js.regions({"a": (0.0, 0.5), "b": (0.5, 1.0)}, spacing=0.125)
     assert "RegionCloud" in shells._repr_html_()

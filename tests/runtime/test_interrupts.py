@@ -45,14 +45,15 @@ def interrupted(call, after):
 
 
 # Compiled before: that takes longer than all else.
-kernel = js.SuperGaussian(h=0.1, d=3.5)
-js.solve(problem, large, order=3), js.tune(problem, small, kernel, order=2, steps=2), right()
+solved = lambda: js.solve(problem, large, order=2, depth=0)
+tuned = lambda n: js.tune(problem, small, js.SuperGaussian(h=0.1, d=3.5), method="SSPH", order=2, steps=n)
+solved(), tuned(2), right()
 for after in (0.02, 0.05, 0.1, 0.2):  # in the search, the local fits, the assembly
-    print("solve", interrupted(lambda: js.solve(problem, large, order=3), after))
+    print("solve", interrupted(solved, after))
     right()
 # Stands for a factorisation, during which Python does not look at signals.
 print("factorisation", interrupted(lambda: interruptible(lambda: time.sleep(20)), 0.3))
-print("tune", interrupted(lambda: js.tune(problem, small, kernel, order=2, steps=10**5), 0.2))
+print("tune", interrupted(lambda: tuned(10**5), 0.2))
 right()
 sys.stdout.flush()
 os._exit(0)  # jaxlib 0.10.2, once interrupted in a compilation, may crash when the interpreter ends

@@ -24,7 +24,7 @@ def two_cores(monkeypatch):
 
 
 def solved(seed):
-    return js.solve(PROBLEM, js.rectangle((0, 0), (1, 1), (21, 21), jitter=0.2, seed=seed))
+    return js.solve(PROBLEM, js.rectangle((0, 0), (1, 1), (21, 21), jitter=0.2, seed=seed), order=2, depth=0)
 
 
 def test_pieces_make_the_whole_and_compile_once(two_cores, monkeypatch):

@@ -149,6 +149,38 @@ def test_an_unknown_that_enters_nonlinearly_and_derivatives():
     assert not bool(jax.jit(lambda: js.solve(ask, ROD).converged)())
 
 
+def test_steps_without_depth_where_deep_ones_do_not_settle():
+    """u'' / 4000 + u - u^3 + q = 0 on layers that the particles do not resolve: q = 0 by a value of its solution."""
+    plain = lambda u, x: js.laplacian(u)(x) / 4e3 + u(x) - u(x) ** 3
+    ends, rod = {"left": js.dirichlet(-1.0), "right": js.dirichlet(1.0)}, js.interval(0.0, 1.0, 21)
+    known = js.solve(js.Problem(plain, ends), rod)
+    assert known.depth == 0 and any("without depth" in told for told in known.stats["messages"])
+    given = [js.constraint(lambda s: s.u[8], float(known.u[8]))]
+    problem = js.Problem(lambda u, x, g: plain(u, x) + g["q"], ends, unknowns={"q": 0.01}, constraints=given)
+    sol = js.solve(problem, rod)
+    assert sol.converged and sol.depth == 0 and any("without depth" in told for told in sol.stats["messages"])
+    assert abs(sol.unknowns["q"]) < 1e-9 and abs(sol.u - known.u).max() < 1e-9
+
+
+def test_a_coefficient_is_found_under_jit():
+    """u'' + p c u = -1 by its value in the middle, as without jit; p is traced, so that nothing says that c is a factor
+    but what is traced."""
+    rod = js.interval(0.0, 1.0, 9)
+
+    def found(p, middle):
+        pde = lambda u, x, p, g: js.laplacian(u)(x) + p * g["c"] * u(x) + 1.0
+        given = [js.constraint(lambda s: s.u[4], middle)]
+        problem = js.Problem(pde, BOTH, params=p, unknowns={"c": 3.0}, constraints=given)
+        sol = js.solve(problem, rod, depth=0, solver="dense")
+        return sol.unknowns["c"], sol.converged
+
+    right, _ = found(2.0, 0.2)
+    (value, converged), slope = mm.quickly(jax.value_and_grad(found, (0, 1), has_aux=True))(2.0, 0.2)
+    assert bool(converged) and abs(value - right) < 1e-9
+    step = (found(2.0, 0.2 + 1e-5)[0] - found(2.0, 0.2 - 1e-5)[0]) / 2e-5
+    assert abs(slope[0] + right / 2.0) < 1e-6 and abs(slope[1] - step) < 1e-6 * abs(step)  # p c is one number
+
+
 def test_a_free_constant_of_a_nonlinear_problem():
     """u'' + u'^2 = 1 + x^2 with the slopes 0 and 1: u = x^2 / 2 + 2 - 1 / 6, whose mean is 2."""
     ends = {"left": js.neumann(0.0), "right": js.neumann(1.0)}

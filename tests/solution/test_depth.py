@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import jsmitsm as js
+from jsmitsm.discretization.layout import discretize
 
 SIDES = ("left", "right", "bottom", "top")
 SQUARE = js.rectangle((0, 0), (1, 1), (12, 12), jitter=0.3)
@@ -136,6 +137,21 @@ def test_a_series_that_diverges_beside_a_line_gives_way_to_values():
     assert np.abs(sol.u - right).max() < 3e-3 * np.abs(right).max()
 
 
+def test_around_a_point_where_the_source_is_infinite_its_values_tell():
+    """u = r, whose source is 1 / r: beside the corner its series made 80 of 1e-4, on spacings that shrink toward it."""
+    radius = lambda x: jnp.sqrt(x @ x)
+    cloud = js.from_polygon(
+        [(0, 0), (1, 0), (1, 1), (0, 1)], lambda x: np.clip(0.25 * np.linalg.norm(x, axis=1), 1e-4, 0.2)
+    )
+    problem = js.Problem(lambda u, x: js.laplacian(u)(x) - 1.0 / radius(x), {"boundary": js.dirichlet(radius)})
+    sol = js.solve(problem, cloud, order=6)
+    right = np.linalg.norm(cloud.points, axis=1)
+    near = right < 1e-3
+    assert sol.depth == 4 and near.sum() > 10
+    # Every value there is below 1e-3, and a straight line through the values of a spacing misses a tenth of them.
+    assert np.abs(sol.u - right)[near].max() < 1e-4
+
+
 def test_a_kink_outside_of_the_domain_changes_nothing():
     smooth, kinked = (lambda x: wave(x) + (x[0] + 1.0) ** 3 / 6.0), (lambda x: x[0] + 1.0)
     held = {s: js.dirichlet(smooth) for s in SIDES}
@@ -154,6 +170,19 @@ def test_gradients_through_a_deep_solve(formulation, bent):
         ends = {"left": js.dirichlet(1.0), "right": js.dirichlet(lambda x, a: a)}
         sol = js.solve(js.Problem(pde, ends, params=a), ROD, order=4, depth=4, formulation=formulation)
         return jnp.sum(sol.u**2) + sol(jnp.array([[0.33]]))[0]
+
+    step = 1e-5
+    expected = (value(3.0 + step) - value(3.0 - step)) / (2 * step)
+    assert jax.grad(value)(3.0) == pytest.approx(float(expected), rel=1e-6)
+
+
+def test_gradients_where_the_source_is_infinite():
+    """At an end; what an infinite value does to its own derivatives does not spread."""
+
+    def value(a):
+        pde = lambda u, x, a: js.laplacian(u)(x) - a * x[0] ** (-0.1 * a)
+        ends = {"left": js.dirichlet(1.0), "right": js.dirichlet(0.0)}
+        return jnp.sum(js.solve(js.Problem(pde, ends, params=a), ROD, order=4, depth=4).u ** 2)
 
     step = 1e-5
     expected = (value(3.0 + step) - value(3.0 - step)) / (2 * step)
@@ -186,6 +215,57 @@ def test_auto_goes_as_deep_as_pays():
     assert solved(poisson, exact, cube, order=2, depth="auto")[0].depth == 2
     assert solved(helmholtz, exact, cube, order=3, depth="auto")[0].depth == 2
     assert solved(poisson, wave, order=3, method="III", depth="auto")[0].depth == 0
+
+
+def deep(operator, exact, order=6, cloud=SQUARE, params=None):
+    """How deep it goes by itself; nothing is solved."""
+    held = {name: js.dirichlet(0.0) for name in cloud.groups if name != "interior"}
+    pde = lambda u, x, *p: operator(u, x) - exact(x, *p)
+    problem = js.Problem(pde, held, params=params)
+    return discretize(problem, cloud, "S", order, None, None, None, sources=False).rec.depth
+
+
+def turned(x, k):
+    return jnp.sin(k * (0.6 * x[0] + 0.8 * x[1]) + 0.3)
+
+
+@pytest.mark.parametrize(
+    "operator, k, order, depth",
+    [
+        (poisson, 2.0, 6, 4), (poisson, 8.0, 6, 4), (poisson, 20.0, 6, 6), (poisson, 2.0, 4, 4), (poisson, 20.0, 12, 4),
+        (diffusion, 1.0, 4, 2), (diffusion, 8.0, 4, 4), (diffusion, 20.0, 6, 4),
+        (lambda v, x: poisson(v, x) + 0.1 * v(x), 2.0, 6, 4), (lambda v, x: poisson(v, x) + 400.0 * v(x), 2.0, 6, 6),
+        (lambda v, x: poisson(v, x) + 20.0 * js.grad(v)(x)[0], 20.0, 6, 4),
+    ],
+)  # fmt: skip
+def test_the_data_decide_how_deep(operator, k, order, depth):
+    """By the angle k r, r the radius of a support, here about .25 at order 6: below .8 they are mild, above 3.2 they
+    oscillate; only a constant operator without convection goes deeper than four."""
+    assert deep(operator, lambda x: turned(x, k), order) == depth
+
+
+def test_what_cannot_be_known_is_taken_for_usual():
+    mild = lambda x: turned(x, 2.0)
+    assert deep(poisson, mild) == 4  # so few particles of a constant operator gain nothing by less
+    assert deep(poisson, mild, cloud=js.rectangle((0, 0), (1, 1), (33, 33))) == 2
+    assert deep(diffusion, mild) == 2
+    finer = js.from_polygon([(0, 0), (1, 0), (1, 1), (0, 1)], lambda x: 0.01 + 0.2 * np.linalg.norm(x, axis=1))
+    assert deep(diffusion, mild, cloud=finer) == 4  # supports of very different sizes
+    assert deep(diffusion, lambda x: jnp.abs(x[0] - 0.5)) == 4  # a kink
+    found = []
+
+    def in_sum(k):
+        found.append(deep(diffusion, lambda x, p: turned(x, p), params=k))
+        return 0.0 * k
+
+    in_sum(2.0), jax.grad(in_sum)(2.0), jax.jit(in_sum)(2.0)
+    assert found == [2, 2, 4]  # a derivative alone changes nothing
+
+
+def test_waves_are_worth_six_degrees():
+    exact = lambda x: turned(x, 20.0)
+    (usual, four), (found, six) = (solved(poisson, exact, order=6, depth=depth) for depth in (4, "auto"))
+    assert (usual.depth, found.depth) == (4, 6) and six * 1.5 < four
 
 
 @pytest.mark.parametrize(

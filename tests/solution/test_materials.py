@@ -132,6 +132,24 @@ def test_newton_conductivities_and_contacts_that_depend_on_u():
     assert abs(sol([[0.5]], region="b")[0] - root - drop) < 2e-6
 
 
+def test_newton_in_two_layers_from_far_and_past_layers_that_are_not_resolved():
+    cloud = js.regions({"a": (0.0, 0.5), "b": (0.5, 1.0)}, spacing=0.05)
+    # (u^2 u')' = 0: nothing is left of it at u = 0, and the start spreads from the ends. u^3 is linear.
+    porous = lambda u, x: js.divergence(lambda y: u(y) ** 2 * js.grad(u)(y))(x)  # noqa: E731
+    flux = dict.fromkeys("ab", lambda u, x, n: u(x) ** 2 * n @ js.grad(u)(x))
+    ends = {"boundary": js.dirichlet(lambda x: 1.0 + x[0])}
+    sol = js.solve(js.Problem(dict.fromkeys("ab", porous), {**ends, "a|b": js.interface(flux)}), cloud)
+    assert sol.converged and np.abs(sol.u**3 - 1 - 7 * cloud.points[:, 0]).max() < 1e-4  # order 4
+    between = {"a|b": js.interface(conduction({"a": 1.0, "b": 1.0}))}
+    sharp = lambda u, x: js.laplacian(u)(x) / 4e3 + u(x) - u(x) ** 3  # noqa: E731
+    ends = {"boundary": js.dirichlet(lambda x: 2.0 * x[0] - 1.0)}
+    sol = js.solve(js.Problem(dict.fromkeys("ab", sharp), {**ends, **between}), cloud)
+    assert sol.converged and sol.depth == 0 and sol.flags
+    none = lambda u, x: js.laplacian(u)(x) + 4.0 * jnp.exp(u(x))  # noqa: E731
+    with pytest.raises(js.SolveError, match="steps without depth"):
+        js.solve(js.Problem(dict.fromkeys("ab", none), {"boundary": js.dirichlet(0.0), **between}), cloud)
+
+
 # ------------------------------------------------------------------ the plane
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from jsmitsm.cloud.cloud import Cloud, kept
 from jsmitsm.discretization.parts.whole import Part
+from jsmitsm.discretization.resolution.turning import USUAL, few, turning
 from jsmitsm.equation.traced import Traced
 from jsmitsm.particle.recursion import Recursion
 from jsmitsm.runtime.tracers import concrete, is_traced
@@ -20,6 +21,10 @@ from jsmitsm.runtime.tracers import concrete, is_traced
 TRAVELLING, CARRIED, PECLET, STRONG = 10, 8, 5.0, 50.0
 # Particles whose coefficients are looked at.
 LOOKED_AT = 64
+# Data that turn within a support by less than the first angle are mild (half of it where lower terms make waves), by
+# more than the second they oscillate. Of a constant operator it is worth a look from the third order on, up to the
+# fourth there is room for more.
+MILD, OSCILLATING, WORTH, HIGH = 0.8, 3.2, 6, 10
 SINGLE = (
     "JAX computes in float32 here, the solution has seven digits at most and fewer at higher orders; put "
     'jax.config.update("jax_enable_x64", True) at the beginning of the program, or where it is meant give particles in '
@@ -38,17 +43,31 @@ def warn_of_float32(cloud: Cloud) -> None:
         kept(cloud, SINGLE, warn)
 
 
-def suited_depth(method: str, rec: Recursion, flat: bool, sourced: bool) -> int:
+def suited_depth(
+    method: str, rec: Recursion, flat: bool, sourced: bool, traced: Traced, cloud: Cloud, params: Any,
+    held: list[np.ndarray], part: Part | None = None,
+) -> int:  # fmt: skip
     """How many degrees the recursion should go beyond the fit.
 
-    Measured: two degrees have all of the gain where the solution is mild, four gain 2 to 10 times more where it
-    oscillates. I, II and III are the paper's. Where neither the operator nor a source has anything to say there, none.
+    Measured: two degrees have all of the gain where the data are mild, four gain 2 to 10 times more where they turn
+    within a support, and two more as much again where a constant operator or its source oscillates. I, II and III are
+    the paper's. Where neither the operator nor a source has anything to say there, none.
     """
     if method != "S" or rec.order < 2 or (flat and not sourced):
         return 0
     if rec.order == 2 or (rec.dim == 3 and not flat):
         return 2
-    return 4
+    if rec.dim == 1 or (traced.constant and rec.order < WORTH) or (sourced and traced.source == "zero"):
+        return USUAL
+    found = turning(rec, traced, cloud, params, held, part)
+    if found is None:
+        return USUAL
+    # Where a few eliminations serve all, depth costs next to nothing.
+    dear = not traced.constant or (flat and not few(traced, cloud, part))
+    if dear and max(found.source, found.coefficients, 2.0 * found.reaction, 2.0 * found.carried) < MILD:
+        return 2
+    waves = max(found.source, found.reaction) if traced.constant and not found.carried else 0.0
+    return 6 if rec.dim == 2 and rec.order <= HIGH and waves > OSCILLATING else USUAL
 
 
 def room(rec: Recursion, order: int, traced: Traced, cloud: Cloud, params: Any, part: Part | None = None) -> int:

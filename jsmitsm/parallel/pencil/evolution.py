@@ -15,7 +15,7 @@ from jsmitsm.parallel.distributed import ParallelCloud, bisected, slab_of
 from jsmitsm.parallel.local import OfOwn, Settings
 from jsmitsm.parallel.pencil.run import ParallelRun, TimedLocal
 from jsmitsm.parallel.pencil.space import OwnSystem
-from jsmitsm.parallel.solving import refuse_others
+from jsmitsm.parallel.solving import refuse_others, refuse_traced
 from jsmitsm.parallel.team import team
 from jsmitsm.runtime.arrays import ValueOrFunction
 from jsmitsm.runtime.errors import SolveError, did_you_mean, explained, explaining
@@ -108,6 +108,7 @@ def evolve(
             raise ValueError(f"scheme: {scheme!r} is none of {', '.join(map(repr, SCHEMES))}, which are made for "
                              f"several processes{did_you_mean(scheme, SCHEMES)}")  # fmt: skip
         refuse_others(problem, cloud, "S", "auto", solver)
+        refuse_traced(u0, t)
         probe: Any = cloud.slab.cloud() if isinstance(cloud, ParallelCloud) else cloud
         check(problem, probe, t, steps, tol, order, scheme, True, False)
         t0, t1 = float(t[0]), float(t[1])

@@ -22,6 +22,7 @@ from jsmitsm.parallel.local import Local, Settings
 from jsmitsm.parallel.pencil.assemble import fits_miss, pencil_of_part
 from jsmitsm.parallel.pencil.space import OwnSemidiscrete
 from jsmitsm.parallel.shares import local_problem
+from jsmitsm.parallel.solving import refuse_traced
 from jsmitsm.parallel.team import Team
 
 
@@ -79,7 +80,9 @@ class ParallelRun(Run):
         with local.team.phase():
             pair = second and isinstance(self.u0, (tuple, list)) and len(self.u0) == 2
             u0 = tuple(map(cut, self.u0)) if pair else self.u0 if second else cut(self.u0)
-            return tuple(np.asarray(v) for v in starting_values(u0, local.cloud, fields, second))
+            values = starting_values(u0, local.cloud, fields, second)
+            refuse_traced(values)
+            return tuple(map(np.asarray, values))
 
     def _scheme(self, asked: str) -> str:
         found = super()._scheme(asked)

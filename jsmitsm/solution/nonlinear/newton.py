@@ -33,6 +33,7 @@ STALLED = 1e-7
 # Where only the first full step tells how large the solution is, it may be this much larger than that.
 WARY = 0.01
 NOTHING = "the equation says nothing"
+SHALLOW = "With a recursion deeper than the order Newton's steps do not settle; this is without depth."
 # So many full steps in the end, until one is this short.
 WANDERING, NEAR = 30, 1e-3
 
@@ -189,9 +190,7 @@ def without_depth(record: Record, begin: Iterate, search: Callable[[Any, Iterate
     if deep is not None and deep.good:
         return deep
     record.become(other)
-    record.run.messages.append(
-        "With a recursion deeper than the order Newton's steps do not settle; this is without depth."
-    )
+    record.run.messages.append(SHALLOW)
     return found
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from jsmitsm.discretization.leave_one_out import with_held
 from jsmitsm.equation.problem import Problem
 from jsmitsm.equation.unknowns.stated import floats
-from jsmitsm.runtime.jaxprs import EVERYTHING, Literal, levels
+from jsmitsm.runtime.jaxprs import used_inputs
 from jsmitsm.runtime.progress import bar
 from jsmitsm.runtime.tracers import concrete, is_traced
 from jsmitsm.solution.fit import Fit, Recipe
@@ -229,9 +229,7 @@ def _multiplies(run: Bordered, start: dict[str, Any]) -> bool:
     def rows(unknowns: dict[str, Any]) -> list[Any]:
         return [x for x in run.numbers_of(run.moved(unknowns)).of_matrix if concrete(x) is None]
 
-    made = jax.make_jaxpr(rows)(start).jaxpr
-    needed = [v for eqn, _ in levels(made, [EVERYTHING] * len(made.outvars)) for v in eqn.invars] + made.outvars
-    return bool({v for v in needed if not isinstance(v, Literal)} & set(made.invars))
+    return any(used_inputs(jax.make_jaxpr(rows)(start).jaxpr))
 
 
 def _same(one: list[Any], two: list[Any]) -> bool:

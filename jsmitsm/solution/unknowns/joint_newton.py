@@ -27,6 +27,7 @@ from jsmitsm.runtime.progress import bar
 from jsmitsm.runtime.tracers import concrete, is_traced
 from jsmitsm.solution.nonlinear.damped import Found, damped
 from jsmitsm.solution.nonlinear.newton import (
+    SHALLOW,
     compiled,
     from_nearer,
     judged,
@@ -159,7 +160,7 @@ def joint_newton(run: Bordered, lines: Lines, unknowns: dict[str, Any], u0: Any)
     missed = lines.missed(here.values, stepping.named(here.unknowns), here.taylor)
     if any(concrete(x) is None for x in (*here, missed)):
         return _compiled(stepping, here)
-    here = here.numbers()
+    here, depth = here.numbers(), run.disc.rec.depth
     with bar("Newton steps") as shown:
         target = _stepped(stepping, here)
         if target is None:
@@ -180,6 +181,8 @@ def joint_newton(run: Bordered, lines: Lines, unknowns: dict[str, Any], u0: Any)
             last = stepping.again(last)
     else:
         found = judged(run, found._replace(at=last))
+    if run.disc.rec.depth < depth:
+        run.messages.append(SHALLOW)
     if not found.good and not run.failed:
         run.fail(
             "Newton's method for values and unknowns did not converge: the next step would still change them by "
@@ -243,7 +246,7 @@ def _first(run: Bordered, u0: Any) -> tuple[Any, Any]:
         taylor = np.pad(taylor, ((0, 0), (0, 0), (0, less)))
     if is_traced(good):
         good = good & jnp.isfinite(values).all() & jnp.isfinite(taylor).all()
-        return tuple(jnp.where(good, x, y) for x, y in zip((values, taylor), here))
+        return jnp.where(good, values, here[0]), jnp.where(good, taylor, here[1])
     return values, taylor
 
 
