@@ -157,6 +157,6 @@ def test_several_regions_are_looked_at_between_their_particles(left, right, word
     flux = {name: lambda u, x, n, k=k: k * n @ js.grad(u)(x) for name, k in (("a", 1.0), ("b", 3.0))}
     at = lambda f, x: f(x[0]) if callable(f) else f
     pde = lambda k, f: lambda u, x: k * js.laplacian(u)(x) + at(f, x)
-    pdes, bcs = {"a": pde(1.0, left), "b": pde(3.0, right)}, {"boundary": js.dirichlet(0.0), "a|b": js.interface(flux=flux)}
-    sol = js.solve(js.Problem(pdes, bcs), cloud)
+    bcs = {"boundary": js.dirichlet(0.0), "a|b": js.interface(flux=flux)}
+    sol = js.solve(js.Problem({"a": pde(1.0, left), "b": pde(3.0, right)}, bcs), cloud)
     assert not sol.flags if words is None else any(words in flag for flag in sol.flags)
