@@ -144,3 +144,19 @@ def test_branches_without_a_kink_leave_the_estimate_alone():
     ):
         sol = js.solve(js.Problem(lambda u, x, f=bend: js.laplacian(u)(x) - f(x[0]), ends), js.interval(0.0, 1.0, 11))
         assert sol.error_estimate().max() < 1e-12 and not sol.flags
+
+
+@pytest.mark.parametrize(
+    "left, right, words",
+    [(1.0, lambda x: jnp.sin(3.0 * x), None),
+     (1.0, lambda x: 1.0 + 2000.0 * bump(x, 0.775, 0.004), "Between the particles the equations"),
+     (lambda x: jnp.where(x < 0.3, 30.0, 0.0), 1.0, "Beyond kinks or jumps")],
+)  # fmt: skip
+def test_several_regions_are_looked_at_between_their_particles(left, right, words):
+    cloud = js.regions({"a": (0.0, 0.5), "b": (0.5, 1.0)}, spacing=0.05)
+    flux = {name: lambda u, x, n, k=k: k * n @ js.grad(u)(x) for name, k in (("a", 1.0), ("b", 3.0))}
+    at = lambda f, x: f(x[0]) if callable(f) else f
+    pde = lambda k, f: lambda u, x: k * js.laplacian(u)(x) + at(f, x)
+    bcs = {"boundary": js.dirichlet(0.0), "a|b": js.interface(flux=flux)}
+    sol = js.solve(js.Problem({"a": pde(1.0, left), "b": pde(3.0, right)}, bcs), cloud)
+    assert not sol.flags if words is None else any(words in flag for flag in sol.flags)
