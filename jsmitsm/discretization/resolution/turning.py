@@ -60,7 +60,7 @@ def turning(
     if radius is None:
         return None
     degree = DEGREE
-    if few(traced, cloud, part):  # the very series that are used afterwards, and remembered until then
+    if part is None and few(traced, cloud, part):  # the very series that are used afterwards, and remembered until then
         free = np.ones(len(cloud), bool)
         for ids in held:
             free[ids] = False
@@ -82,7 +82,7 @@ def turning(
 
 def few(traced: Traced, cloud: Cloud, part: Part | None) -> bool:
     """Whether one evaluation of a source more takes longer than some degrees less would save."""
-    return traced.constant and part is None and len(cloud) <= FEW
+    return traced.constant and (len(cloud) if part is None else part.count) <= FEW
 
 
 def _sample(points: np.ndarray, size: int, part: Part | None) -> tuple[np.ndarray, float | None]:
