@@ -11,6 +11,7 @@ from jsmitsm.cloud.neighbours import Stencils
 from jsmitsm.cloud.regions.region_cloud import RegionCloud
 from jsmitsm.discretization.layout import Discretization, discretize
 from jsmitsm.equation.problem import Problem
+from jsmitsm.equation.regions.interface import INTERFACE
 from jsmitsm.equation.regions.per_region import PerRegion
 from jsmitsm.linear.linsolve import SOLVERS, Solver
 from jsmitsm.particle.kernels import Kernel
@@ -64,6 +65,13 @@ def of_regions(problem: Any, cloud: Any) -> bool:
             f"pde: the cloud has the regions {list(cloud.regions)}; give an equation for each, "
             f"js.Problem({{{list(cloud.regions)[0]!r}: pde, ...}}, bcs)"
         )
+    if not several and isinstance(problem, Problem):
+        for group, conditions in problem.bcs.items():
+            if any(c.kind == INTERFACE for c in conditions):
+                raise ValueError(
+                    f"bcs[{group!r}]: js.interface binds two regions, and the cloud has none; make it with js.regions, "
+                    "or give the boundary a condition of its own (js.dirichlet, js.neumann, js.robin, js.condition)"
+                )
     return several
 
 

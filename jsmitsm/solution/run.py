@@ -102,7 +102,7 @@ class Run:
             self._tell_repairs()
         assert self.health is not None
         bad = self.health.undetermined
-        if len(bad) and not np.isfinite(np.asarray(nums.jac)).all():
+        if len(bad) and not all(np.isfinite(np.asarray(own.jac)).all() for own in getattr(nums, "parts", [nums])):
             self.fail(
                 f"the equation or its derivative by u is not finite at {len(bad)} particle(s), first {some(bad)}: "
                 "start nearer to the solution (u0), inside the range for which the pde is defined",

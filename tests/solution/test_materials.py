@@ -302,6 +302,13 @@ def test_conditions_are_never_guessed():
     refused(r"region 'a' is too small: .* particles are too few", cloud=small, order=8)
     with pytest.raises(ValueError, match="several regions are for js.solve, js.factorize, js.evolve, js.eigen"):
         js.tune(js.Problem(both, {**ends, "a|b": good}), cloud, js.Gaussian(0.1, 3.0))
+    with pytest.raises(ValueError, match="js.interface binds two regions, and the cloud has none"):
+        js.solve(js.Problem(laplace, {"left": good, "right": js.dirichlet(0.0)}), js.interval(0.0, 1.0, 9))
+    same = js.interface(residual=lambda a, b, x, n: (a(x) - b(x)) * jnp.array([1.0, 2.0]))
+    with pytest.raises(js.SolveError, match="do not determine the solution"):
+        js.solve(js.Problem(both, {**ends, "a|b": same}), cloud)
+    with pytest.raises(ValueError, match="lies on an interface"):
+        js.solve(js.Problem(both, {**ends, "a|b": good}, sources=[js.point_source([0.5], 1.0)]), cloud)
     with pytest.raises(ValueError, match="give either flux"):
         js.interface()
     with pytest.raises(ValueError, match="jump: the residual says everything"):

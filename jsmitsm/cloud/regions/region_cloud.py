@@ -199,7 +199,17 @@ def _check_pairs(cloud: RegionCloud, owner: np.ndarray) -> None:
     if (owner < 0).any():
         raise ValueError(f"regions: particles {some(np.flatnonzero(owner < 0))} belong to no region; add them to one")
     names, points, paired = list(cloud.regions), np.asarray(cloud.points), np.zeros(len(cloud), bool)
+    twice = np.concatenate([np.zeros(0, int), *cloud.regions.values()])
+    if len(twice) != len(np.unique(twice)):
+        at = np.flatnonzero(np.bincount(twice) > 1)
+        raise ValueError(f"regions: particles {some(at)} belong to two regions; give each a copy there, and pair them")
     for name, pairs in cloud.interfaces.items():
+        if name.count("|") != 1 or not set(name.split("|")) <= set(names):
+            raise ValueError(f"interfaces: {name!r} does not name two of the regions {names}, as \"a|b\"")
+        if len(pairs) and not (0 <= pairs.min() and pairs.max() < len(cloud)):
+            raise ValueError(f"interfaces[{name!r}]: particle {pairs.max()} of a pair is none of the {len(cloud)}")
+        if len(np.unique(pairs, axis=0)) < len(pairs):
+            raise ValueError(f"interfaces[{name!r}]: a pair stands there twice; name each once")
         first, second = (names.index(side) for side in sides(name))
         apart = np.flatnonzero((points[pairs[:, 0]] != points[pairs[:, 1]]).any(axis=1))
         if len(apart):

@@ -107,9 +107,6 @@ class RegionsRun(Run):
         self.judge(nums, rows)
         return classes, rows
 
-    def _finite(self, nums: RegionNumbers) -> bool:
-        return all(np.isfinite(np.asarray(own.jac)).all() for own in nums.parts)
-
     def assembled(self, nums: RegionNumbers, parts: Any = None) -> tuple[Any, Any, Any, Any]:  # type: ignore[override]
         clock, start = time.perf_counter, time.perf_counter()
         self._forget()

@@ -11,6 +11,7 @@ import numpy as np
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.cloud.regions.region_cloud import RegionCloud
 from jsmitsm.equation.unknowns.point_source import Kelvin, Singular, derivative_of
+from jsmitsm.runtime.errors import short
 from jsmitsm.runtime.tracers import concrete, is_traced
 from jsmitsm.solution.evaluation import checked_points, in_domain
 from jsmitsm.solution.look.sizes import NOTHING
@@ -165,6 +166,10 @@ def check_inside(sources: Any, cloud: Cloud) -> None:
         raise ValueError(f"sources: x0 = {np.asarray(at)} is outside of the domain; a point source lies inside of it")
 
 
+# A source nearer to a particle on an interface than this part of the spacing lies on it.
+ON_INTERFACE = 1e-6
+
+
 def regions_of_sources(sources: Any, cloud: RegionCloud) -> list[str]:
     """The region in which each source lies."""
     check_inside(sources, cloud)
@@ -178,5 +183,12 @@ def regions_of_sources(sources: Any, cloud: RegionCloud) -> list[str]:
             )
         if np.shape(place) != (cloud.dim,):
             raise ValueError(f"sources[{k}]: x0 has {len(place)} coordinate(s), the cloud {cloud.dim}")
+        between = [cloud.points[pairs[:, 0]] for pairs in cloud.interfaces.values()]
+        away = [np.linalg.norm(np.asarray(concrete(at)) - np.asarray(place, float), axis=1).min() for at in between]
+        if min(away, default=np.inf) <= ON_INTERFACE * cloud.spacing:
+            raise ValueError(
+                f"sources[{k}]: x0 = {short(place)} lies on an interface, where its singular part belongs to neither "
+                "region; move it into one of them, or state it as js.interface(source=...) of a width of its own"
+            )
         out.append(names[int(located(cloud, np.asarray(place, float)[None])[0])])
     return out
