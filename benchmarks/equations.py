@@ -24,7 +24,7 @@ from benchmarks.problems import CASES, FACTOR, RANK, Case
 
 DATA = Path(__file__).parent / "data" / "equations.json"
 # Errors below this are rounding alone: they have no order, and no estimate knows where they are.
-ROUND_OFF = 1e-13
+ROUND_OFF = {"loo": 1e-13, "lsq": 5e-13}
 MEASURED = {name: case for name, case in CASES.items() if case.ceilings}
 
 
@@ -77,7 +77,7 @@ def estimated(case: Case, sol: js.Solution) -> dict[str, Any]:
 def missed(line: dict[str, Any]) -> list[str]:
     """What a line of the table fails to reach."""
     case, order = CASES[line["case"]], line["order"]
-    rounded = line["error"] <= ROUND_OFF
+    rounded = line["error"] <= ROUND_OFF[line["formulation"]]
     kept = {
         "error": line["error"] <= line["ceiling"],
         "particles": case.particles is None or line["particles"] <= case.particles,
