@@ -298,8 +298,8 @@ def _beside(fit: Fit, low: Discretization) -> int:
     """The order whose solution is compared with."""
     order = fit.recipe.order
     host = concrete(fit.cloud.points)
-    # A host of None is told where the stencils are made. Where an axis lags behind, as time does, solutions of two orders
-    # are not the same though their recursions end at one degree.
+    # A host of None is told where the stencils are made. Where an axis lags behind, as time does, solutions of two
+    # orders are not the same though their recursions end at one degree.
     if host is None or lags(low.rec):
         return order + 2
     most = room(low.rec, order + 2, low.traced, low.cloud, fit.problem.params)

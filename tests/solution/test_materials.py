@@ -404,7 +404,8 @@ def test_constraints_and_unknowns_speak_of_regions_and_interfaces():
                          constraints=[js.constraint(cases[0][0], 1.0)])  # fmt: skip
     alone = dict(bcs, **{"a|b": js.interface({n: lambda u, x, n_, c=c: c * n_ @ js.grad(u)(x) for n, c in k.items()},
                                              resistance=0.2)})  # fmt: skip
-    w = js.solve(js.Problem({n: lambda u, x: js.laplacian(u)(x) + 1.0 for n in k}, alone), cloud, depth=0).integral(region="a")
+    of_one = js.Problem({n: lambda u, x: js.laplacian(u)(x) + 1.0 for n in k}, alone)
+    w = js.solve(of_one, cloud, depth=0).integral(region="a")
     near = js.solve(product.replace(unknowns={"q": 1.3 * float(w)}), cloud, depth=0)
     assert abs(near.unknowns["q"] - w) < 1e-9 * w
     with pytest.raises(js.SolveError, match="did not converge"):
