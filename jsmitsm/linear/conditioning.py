@@ -60,6 +60,11 @@ def inverse_norm(apply: Callable[..., Any], n: int, entries: Any = None) -> floa
     return max(best, 2.0 * mine.total(float(abs(apply(alternating, False)).sum())) / (3.0 * n))
 
 
+def to_one(largest: np.ndarray) -> np.ndarray:
+    """Powers of two that bring these numbers to about one; one for zeros."""
+    return np.exp2(-np.round(np.log2(np.where(largest > 0, largest, 1.0))))
+
+
 def near_null_vector(apply: Callable[..., Any], n: int) -> np.ndarray:
     """Unit vector (n,) that A maps nearest to zero: three powers of (A^T A)^-1."""
     v = np.random.default_rng(1).standard_normal((n, 1))

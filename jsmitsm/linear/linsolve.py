@@ -275,6 +275,13 @@ def _batch(args: Any, axes: Any, *, settings: Settings, transpose: bool) -> Any:
     return (x.reshape(size, depth, *x.shape[1:]) if inner else x), 0
 
 
+def times(data: Any, rows: Any, cols: Any, x: Any) -> Any:
+    """A x (n,) of a square matrix by its entries."""
+    if is_traced(data, x):
+        return jnp.zeros(len(x)).at[rows].add(data * x[cols])
+    return np.bincount(rows, data * x[cols], len(x))
+
+
 def _without(b: Any, data: Any, rows: Any, cols: Any, x: Any) -> Any:
     """b - A x, with the batch axes of the primitive; b may be None."""
     if not _batched(data, rows, cols):

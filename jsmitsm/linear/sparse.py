@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from jsmitsm.linear.backends import SuperLU
-from jsmitsm.linear.conditioning import inverse_norm, near_null_vector
+from jsmitsm.linear.conditioning import inverse_norm, near_null_vector, to_one
 from jsmitsm.linear.ordering import nested_dissection, spatial_order
 from jsmitsm.linear.solver_choice import BACKENDS, DENSE_MAX, ITERATIVE, choose_backends
 from jsmitsm.runtime.collector import uncollected
@@ -353,7 +353,7 @@ def _scales(
             if not largest[some].all():
                 raise SingularMatrix(faults[k], np.flatnonzero(some & (largest == 0)))
             if columns or k == 0:
-                scales[k][some] = np.exp2(-np.round(np.log2(largest[some])))
+                scales[k][some] = to_one(largest[some])
     return sign * scales[0], scales[1]
 
 

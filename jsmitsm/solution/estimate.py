@@ -18,6 +18,7 @@ from jsmitsm.discretization.least_squares import misfit
 from jsmitsm.discretization.leave_one_out import matrix, right_side, with_held
 from jsmitsm.discretization.resolution.digits import lags, room
 from jsmitsm.discretization.rows import all_rows
+from jsmitsm.linear.linsolve import times
 from jsmitsm.particle.moments import Row
 from jsmitsm.particle.recursion import constraints
 from jsmitsm.runtime.errors import SolveError
@@ -282,28 +283,27 @@ def lower(order: int, least: int) -> int:
     return min(order, max(order - 1 - order % 2, 2, least))
 
 
-def compared(order: int, depth: int, most: int, least: int) -> int:
+def compared(order: int, depth: int, most: int, least: int, lagging: bool = False) -> int:
     """The order whose solution tells the error of one of this order and depth: p + 2, or a lower one.
 
     most : by how many degrees the recursion of order p + 2 may go deeper; least : the equation's order.
     In one dimension, and along characteristics, the equation gives all of the coefficients but a few, and solutions of
-    two orders whose recursions end at the same degree are one and the same.
+    two orders whose recursions end at the same degree are one and the same; not so where an axis is ``lagging``, as
+    time does.
     """
     deeper = order + 2 + min(depth, most) > order + depth
     below = lower(order, least)
-    return order + 2 if deeper or below == order else below
+    return order + 2 if deeper or lagging or below == order else below
 
 
 def _beside(fit: Fit, low: Discretization) -> int:
     """The order whose solution is compared with."""
     order = fit.recipe.order
     host = concrete(fit.cloud.points)
-    # A host of None is told where the stencils are made. Where an axis lags behind, as time does, solutions of two
-    # orders are not the same though their recursions end at one degree.
-    if host is None or lags(low.rec):
-        return order + 2
+    if host is None:
+        return order + 2  # told where the stencils are made
     most = room(low.rec, order + 2, low.traced, low.cloud, fit.problem.params)
-    return compared(order, low.rec.depth, most, max(low.rec.orders))
+    return compared(order, low.rec.depth, most, max(low.rec.orders), lags(low.rec))
 
 
 def _put(array: np.ndarray, at: np.ndarray, value: Any) -> np.ndarray:
@@ -351,8 +351,7 @@ def _left(entries: Any, values: Any, right: Any, free: np.ndarray) -> Any:
     data, r, c = entries
     xp: Any = jnp if is_traced(data, values, right) else np
     u = xp.asarray(values).reshape(-1)[free]
-    au = jnp.zeros(u.shape).at[r].add(data * u[c]) if xp is jnp else np.bincount(r, data * u[c], len(u))
-    return right - au
+    return right - times(data, r, c, u)
 
 
 @partial(in_one_program, static=("shape",))

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
-from jsmitsm.linear.conditioning import inverse_norm
+from jsmitsm.linear.conditioning import inverse_norm, to_one
 from jsmitsm.parallel.system import System
 from jsmitsm.parallel.team import Team
 from jsmitsm.runtime.errors import SolveError
@@ -60,9 +58,9 @@ def condition(system: System) -> float:
     rows = np.repeat(np.arange(system.n), np.diff(starts))
     by_row = np.zeros(system.n)
     np.maximum.at(by_row, rows, size)
-    before = _power_of_two(by_row)
+    before = to_one(by_row)
     size *= before[rows]
-    after = _power_of_two(every.collected(columns, size, np.maximum))
+    after = to_one(every.collected(columns, size, np.maximum))
     sums = after * every.collected(columns, size, np.add)
     del size, columns, rows
 
@@ -76,7 +74,3 @@ def condition(system: System) -> float:
     except SolveError:
         return float("inf")
     return system.team.most(float(sums.max(initial=0.0))) * found
-
-
-def _power_of_two(largest: Any) -> np.ndarray:
-    return np.exp2(-np.round(np.log2(np.where(largest > 0, largest, 1.0))))

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from jsmitsm.discretization.health import LEBESGUE
-from jsmitsm.discretization.resolution.digits import room
+from jsmitsm.discretization.resolution.digits import lags, room
 from jsmitsm.parallel.assembly import assembled
 from jsmitsm.parallel.local import Local, Settings
 from jsmitsm.runtime.errors import SolveError
@@ -25,7 +25,7 @@ def corrected(low: Local, values: np.ndarray, taylor: Any) -> tuple[np.ndarray, 
     with us.phase():
         if order + 2 > HIGHEST:  # the highest that may be asked for
             raise ValueError(f"error_estimate: needs expansions of order {order + 2}, and {HIGHEST} is the highest")
-        other = compared(rec.order, rec.depth, _room(low, order + 2), max(rec.orders))
+        other = compared(rec.order, rec.depth, _room(low, order + 2), max(rec.orders), lags(rec))
     error, trust, units = _towards(low, values, taylor, other)
     below = lower(order, max(rec.orders))
     if not (other > order >= HIGH and trust < TRUSTED and below < order):

@@ -71,8 +71,7 @@ def out_of_series(disc: Discretization, nums: Numbers, problem: Problem, fitted:
 
     fitted (N, F, K): the local polynomials.
     """
-    points, place = np.asarray(disc.points, float), np.full(len(disc.cloud), -1)
-    place[nums.ids] = np.arange(len(nums.ids))
+    points, place = np.asarray(disc.points, float), _places(disc, nums)
     missed = np.zeros((disc.rec.n_rows, len(nums.ids)))
     for cls in disc.classes:
         at = place[cls.ids]
@@ -218,8 +217,7 @@ def seam(run: Any, values: Any) -> np.ndarray:
     fitted = np.asarray(all_coefficients(disc, nums, values), float)[owner]
     nowhere = np.zeros((len(aside), disc.rec.dim))
     missed = [residual(disc, run.problem, points[at], nowhere, fitted) for at in (aside, owner)]
-    place = np.full(len(disc.cloud), -1)
-    place[nums.ids] = np.arange(len(nums.ids))
+    place = _places(disc, nums)
     source = np.zeros((disc.rec.n_rows, len(nums.ids)))
     known = place[owner] >= 0
     rows, at = np.array(disc.rec.equation_rows)[:, None], place[owner[known]]
@@ -260,12 +258,18 @@ def unresolved(disc: Discretization, nums: Numbers, problem: Problem, fitted: np
     source or a coefficient that the particles do not see, or whose Taylor series ends before it reaches the neighbours,
     shows there.
     """
-    points, place = np.asarray(disc.points, float), np.full(len(disc.cloud), -1)
-    place[nums.ids] = np.arange(len(nums.ids))
+    points, place = np.asarray(disc.points, float), _places(disc, nums)
     source = np.zeros((disc.rec.n_rows, len(nums.ids)))
     for cls in disc.classes:
         source[np.array(disc.rec.equation_rows)[:, None], place[cls.ids]] = _mean(disc, problem, cls, points, fitted)
     return with_source(nums, source)
+
+
+def _places(disc: Discretization, nums: Numbers) -> np.ndarray:
+    """Where every particle (N,) stands in the numbers, -1 where it does not."""
+    place = np.full(len(disc.cloud), -1)
+    place[nums.ids] = np.arange(len(nums.ids))
+    return place
 
 
 def with_source(nums: Numbers, source: np.ndarray) -> Numbers:
@@ -282,8 +286,7 @@ def unseen(disc: Discretization, nums: Numbers, problem: Problem, rows: Any) -> 
     """
     if not disc.linear or disc.traced.source != "variable" or not disc.scheme.sourced or np.shape(nums.source)[-1] < 2:
         return None
-    points, place = np.asarray(disc.points, float), np.full(len(disc.cloud), -1)
-    place[nums.ids] = np.arange(len(nums.ids))
+    points, place = np.asarray(disc.points, float), _places(disc, nums)
     known, missed = np.asarray(nums.source), np.zeros((disc.rec.n_rows, len(nums.ids)))
     series = [[k for k, (e, _) in enumerate(disc.rec.row_index) if e == f] for f in range(len(disc.rec.orders))]
     for cls in rows[0]:
@@ -297,11 +300,9 @@ def unseen(disc: Discretization, nums: Numbers, problem: Problem, rows: Any) -> 
             return np.where(np.isfinite(away), away, 0.0)  # infinite on the boundary
 
         missed[np.array(disc.rec.equation_rows)[:, None], at] = _around(disc, cls, points, left)
-    zero = np.zeros_like
-    there = replace(nums, source=missed, held=zero(nums.held), given=zero(nums.given), gamma=zero(nums.gamma))
-    found = np.zeros(disc.held.size)
-    found[~disc.held.reshape(-1)] = np.asarray(right_side(disc, there, *rows))
-    return found.reshape(disc.held.shape)
+    found = np.zeros(disc.held.shape)
+    found[~disc.held] = np.asarray(right_side(disc, with_source(nums, missed), *rows))
+    return found
 
 
 def _mean(disc: Discretization, problem: Problem, cls: Class, points: np.ndarray, fitted: np.ndarray) -> np.ndarray:

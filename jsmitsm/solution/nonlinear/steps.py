@@ -22,6 +22,7 @@ import numpy as np
 
 from jsmitsm.discretization.layout import Discretization, discretize
 from jsmitsm.discretization.regions.layout import Regions, discretize_regions
+from jsmitsm.linear.linsolve import times
 from jsmitsm.runtime.errors import SolveError
 from jsmitsm.runtime.tracers import concrete
 from jsmitsm.solution.nonlinear.start import lengths
@@ -222,7 +223,7 @@ class Pull:
         diagonal = np.bincount(r[own], data[own], n)
         diagonal[diagonal == 0] = np.abs(diagonal).max() or 1.0
         u = self.here.reshape(-1)[self.free]
-        left = np.abs(b - np.bincount(r, data * u[c], n)) / np.abs(diagonal)
+        left = np.abs(b - times(data, r, c, u)) / np.abs(diagonal)
         residual = float(np.max(left / self.scales[self.field]))
         if not self.strength:
             self.strength = residual / FIRST

@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm.discretization.leave_one_out import with_held
+from jsmitsm.linear.linsolve import times
 from jsmitsm.runtime.errors import SolveError
 from jsmitsm.runtime.progress import bar
 from jsmitsm.runtime.tracers import concrete, is_traced
@@ -108,7 +109,7 @@ class Stepping:
         def looked(system: Any) -> tuple[Any, Any]:
             nums, (data, r, c, b) = system
             held = _number(with_held(run.disc, nums, np.zeros(len(free)))).reshape(-1)
-            return _times(_number(data), r, c, u) - _number(b), held
+            return times(_number(data), r, c, u) - _number(b), held
 
         xp: Any = jnp if is_traced(u, now) else np
         sizes = MOVED * xp.maximum(abs(now), xp.where(self.begin != 0, abs(self.begin), 1.0))
@@ -254,10 +255,3 @@ def _number(x: Any) -> Any:
     """The numbers behind x, or where there are none x without derivatives."""
     known = concrete(x)
     return jax.lax.stop_gradient(x) if known is None else np.asarray(known)
-
-
-def _times(data: Any, r: Any, c: Any, u: Any) -> Any:
-    """The matrix of these entries times u."""
-    if is_traced(data, r, c, u):
-        return jnp.zeros(len(u)).at[r].add(data * u[c])
-    return np.bincount(r, data * u[c], len(u))

@@ -19,6 +19,8 @@ from jsmitsm.solution.regions.located import located
 from jsmitsm.solution.regions.solution import RegionsSolution
 from jsmitsm.solution.solution import Solution
 
+# A source nearer to a particle on an interface than this part of the spacing lies on it.
+ON_INTERFACE = 1e-6
 _TAYLOR = (
     "coefficients: the Taylor series of a solution with point sources do not converge near them; ask "
     "sol.regular.coefficients for those of the regular part"
@@ -164,10 +166,6 @@ def check_inside(sources: Any, cloud: Cloud) -> None:
     if inside is not None and not np.all(inside):
         at = places[np.flatnonzero(~np.asarray(inside))[0]]
         raise ValueError(f"sources: x0 = {np.asarray(at)} is outside of the domain; a point source lies inside of it")
-
-
-# A source nearer to a particle on an interface than this part of the spacing lies on it.
-ON_INTERFACE = 1e-6
 
 
 def regions_of_sources(sources: Any, cloud: RegionCloud) -> list[str]:
