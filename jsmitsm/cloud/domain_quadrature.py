@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from jsmitsm.cloud.cloud import Cloud
-from jsmitsm.cloud.triangulation import boundary_facets, lying_on, simplices
+from jsmitsm.cloud.triangulation import boundary_facets, lying_on, normals_of, simplices
 from jsmitsm.taylor.multi_indices import multi_indices
 
 # A particle's normal counts at a facet if it is within 30 degrees of the facet's own; beyond, there is a corner.
@@ -42,7 +42,7 @@ def _layers(cloud: Cloud, degree: int) -> tuple[np.ndarray, np.ndarray]:
     corners = points[facets]
     height = _graphs(cloud, corners, facets, normal, degree)
     flat = np.broadcast_to(normal[:, None], corners.shape)
-    own = flat if cloud.normals is None else np.asarray(cloud.normals)[facets]
+    own = normals_of(cloud)[facets]
     swept = np.where((np.sum(own * flat, axis=2) >= _SMOOTH)[..., None], own, flat)
     at, weights = _simplex_rule(cloud.dim - 1, degree // 2 + 1)
     base, way = (np.einsum("qk,mkd->mqd", at, x) for x in (corners, swept))
@@ -70,9 +70,7 @@ def _graphs(cloud: Cloud, corners: np.ndarray, facets: np.ndarray, normal: np.nd
     count = min(len(rim), degree + 2 if dim == 2 else 2 * len(some))
     distance, near = cKDTree(points[rim]).query(middle, k=range(1, count + 1))
     near = rim[near]
-    alike = np.ones(near.shape, bool)
-    if cloud.normals is not None:
-        alike = np.einsum("mkd,md->mk", np.nan_to_num(np.asarray(cloud.normals)[near]), normal) > 0.5
+    alike = np.einsum("mkd,md->mk", np.nan_to_num(normals_of(cloud)[near]), normal) > 0.5
     # A facet's own corners are on its side, whatever normal they have.
     alike |= (near[:, :, None] == facets[:, None, :]).any(axis=2)
     size = np.where(alike, distance, 0.0).max(axis=1)

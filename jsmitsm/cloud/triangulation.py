@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from jsmitsm.cloud.cloud import Cloud
+from jsmitsm.cloud.inside import inside_of
 from jsmitsm.cloud.regions.region_cloud import RegionCloud
 
 # A simplex whose longest edge exceeds this many usual edges of its corners bridges a gap; the first
@@ -22,9 +23,8 @@ def simplices(cloud: Cloud) -> np.ndarray:
     """Intervals, triangles or tetrahedra (M, D + 1) between the particles, those outside of the domain dropped.
 
     A simplex with boundary particles at all its corners lies outside where the shape says so, or, where the cloud knows
-    none, where the normals point into it. Where normals are missing too, it is dropped if its longest edge is much
-    longer than the usual edges of its corners.
-    Without normals the very corner of a notch may be filled, and what a particle on the very boundary sees across it.
+    none, where the normals point into it. Where normals are missing too, fitted ones do, and it is dropped as well if
+    its longest edge is much longer than the usual edges of its corners.
     Those of a cloud of several regions do not cross an interface.
 
     >>> import jsmitsm as js
@@ -115,15 +115,24 @@ def _outside(cloud: Cloud, points: np.ndarray, cells: np.ndarray) -> np.ndarray:
         middle = np.asarray(cloud.points)[cells[which]].mean(axis=1)
         out[which] = cloud._shape.distance(middle)[0] > 1e-9 * np.ptp(middle) if len(which) else False
         return out
-    if cloud.normals is None:
-        # A cloud without any boundary shows its holes by long simplices only.
-        long = _stretch(points, cells)
-        if not len(cloud.boundary):
-            return long > _LONG[0]
-        return (long > _LONG[1]) & suspect | _bridges(points, cells, np.isin(cells, cloud.boundary))
+    if not len(cloud.boundary):  # then long simplices alone show a hole
+        return _stretch(points, cells) > _LONG[0]
     ahead = points[cells].mean(axis=1)[:, None] - points[cells]
     # Zero up to rounding where all corners lie on one straight side.
-    return suspect & ((ahead * np.asarray(cloud.normals)[cells]).sum(axis=(1, 2)) > 1e-9)
+    out = suspect & ((ahead * normals_of(cloud)[cells]).sum(axis=(1, 2)) > 1e-9)
+    if cloud.normals is None and cloud.dim > 1:
+        long = _stretch(points, cells) > _LONG[1]
+        out |= long & suspect | _bridges(points, cells, np.isin(cells, cloud.boundary))
+    return out
+
+
+def normals_of(cloud: Cloud) -> np.ndarray:
+    """The normals (N, D) of a cloud, those of its boundary particles fitted where it has none."""
+    if cloud.normals is not None:
+        return np.asarray(cloud.normals)
+    out = np.full(cloud.points.shape, np.nan)
+    out[cloud.boundary] = inside_of(cloud).normals
+    return out
 
 
 def _bridges(points: np.ndarray, cells: np.ndarray, rim: np.ndarray) -> np.ndarray:

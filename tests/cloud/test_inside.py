@@ -167,6 +167,30 @@ def test_domain_quadrature_is_exact_on_straight_domains(cloud, exact):
     np.testing.assert_allclose(np.sum(weights * points[:, 0] ** 4), exact, rtol=1e-12)
 
 
+@pytest.mark.parametrize("inside, area, round_it", [
+    (lambda x: np.full(len(x), True), 4.0, 8.0),
+    (lambda x: ~(x > 1 + 1e-9).all(axis=1), 3.0, 8.0),
+    (lambda x: abs(x - 1).max(axis=1) > 0.4 - 1e-9, 4.0 - 0.64, 8.0 + 3.2),
+])  # fmt: skip
+def test_quadrature_without_normals(inside, area, round_it):
+    """A lattice of points with sides found by counting neighbours: convex corners, a notch, a hole, to rounding."""
+    points = np.stack(np.meshgrid(*[np.linspace(0, 2, 21)] * 2), axis=-1).reshape(-1, 2)
+    points = points[inside(points)]
+    near = np.abs(points[:, None] - points[None]).max(axis=2) < 0.11
+    rim = near.sum(axis=1) < 9
+    cloud = js.Cloud(points, {"interior": np.flatnonzero(~rim), "rim": np.flatnonzero(rim)})
+    np.testing.assert_allclose(js.quadrature(cloud).weights.sum(), area, rtol=1e-12)
+    np.testing.assert_allclose(js.quadrature(cloud, "rim").weights.sum(), round_it, rtol=1e-12)
+
+
+@pytest.mark.parametrize("gap", [0.03, 0.125, 0.5])
+def test_quadrature_on_two_rods(gap):
+    points = np.concatenate([np.linspace(0, 1, 9), np.linspace(1, 2, 9) + gap])[:, None]
+    cloud = js.Cloud(points, {"interior": np.r_[1:8, 10:17], "ends": [0, 8, 9, 17]})
+    np.testing.assert_allclose(js.quadrature(cloud).weights.sum(), 2.0, rtol=1e-12)
+    assert len(js.quadrature(cloud, "ends").points) == 4
+
+
 def test_the_integral_of_a_solution(sol):
     """Of x y over the ell: over [0, 2] x [0, 1] it is 1, over [0, 1] x [1, 2] 3 / 4; of fields one each."""
     np.testing.assert_allclose(sol.integral(), 1.75, rtol=1e-11)
