@@ -376,6 +376,10 @@ RESIDUALS = [
     ("python-float", residual(lambda u, x: js.laplacian(u)(x) - float(x[0])), "pde", "float"),
     ("callback", residual(lambda u, x: js.laplacian(u)(x) - jax.pure_callback(
         np.sin, jax.ShapeDtypeStruct((), x.dtype), x[0])), "pde|primitive", "no Taylor expansion"),
+    ("random-key", residual(lambda u, x: js.laplacian(u)(x) - jax.random.normal(jax.random.key(0), (3,))[0]),
+     "pde.*random keys", "draw the numbers before"),
+    ("random-key-in-a-condition", ends(left=js.dirichlet(lambda x: jax.random.normal(jax.random.PRNGKey(0), ()))),
+     r"bcs\['left'\].value.*random keys", "draw the numbers before"),
     ("nan-source", residual(lambda u, x: js.laplacian(u)(x) - jnp.log(x[0] - 0.3)), "pde", "finite|NaN"),
     ("singular-source", residual(lambda u, x: js.laplacian(u)(x) - 1.0 / (x[0] - 0.5)), "pde", "finite|NaN"),
     ("nan-coefficient", residual(lambda u, x: jnp.sqrt(x[0] - 0.3) * js.laplacian(u)(x)), "pde", "finite|NaN"),

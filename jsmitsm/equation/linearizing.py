@@ -13,7 +13,19 @@ import numpy as np
 from jsmitsm.equation.field import Field, LocalField, field_p, frozen_p
 from jsmitsm.equation.folding import folded
 from jsmitsm.equation.marks import DIFFERENTIATED
-from jsmitsm.runtime.jaxprs import EVERYTHING, Literal, bind, called, inner_jaxprs, levels, literal, program, scan_sizes
+from jsmitsm.equation.unknowns.parts import parts
+from jsmitsm.runtime.jaxprs import (
+    EVERYTHING,
+    Literal,
+    bind,
+    called,
+    comes_up,
+    inner_jaxprs,
+    levels,
+    literal,
+    program,
+    scan_sizes,
+)
 from jsmitsm.runtime.snapshot import snapshot
 from jsmitsm.runtime.tracers import owned
 from jsmitsm.taylor.elementwise import ELEMENTWISE
@@ -308,9 +320,12 @@ def record(
     dtype = jnp.result_type(float)
     point = jax.ShapeDtypeStruct((field.dim,), dtype)
     others = [jax.ShapeDtypeStruct(tuple(shape), dtype) for shape in extras]
-    first, _ = snapshot(
-        lambda x, e, p: _values(residual(field, x, *e, *(() if params is None else (p,))), dtype), point, others, params
-    )
+    def written(x: Any, e: Any, p: Any) -> jax.Array:
+        return _values(residual(field, x, *e, *(() if params is None else (p,))), dtype)
+
+    first, _ = snapshot(written, point, others, params)
+    if comes_up(first.jaxpr, np.complexfloating):  # within, they are followed as pairs of real numbers
+        first, _ = snapshot(lambda *a: parts(written, *a)[0], point, others, params)
     flat = program(first)
     check_points(flat, [POINT] + [FREE] * (len(flat.invars) - 1))
     needed = [eqn for eqn, _ in levels(flat, [EVERYTHING])]

@@ -56,6 +56,14 @@ def program(closed: ClosedJaxpr, last: int = 0) -> Program:
     return Program(constvars, tuple(jaxpr.invars[:inputs]), tuple(jaxpr.outvars), tuple(jaxpr.eqns))
 
 
+def comes_up(jaxpr: Any, kind: Any) -> bool:
+    """Whether numbers of a kind, as ``np.complexfloating``, come up in a jaxpr or in what it calls."""
+    some = [*jaxpr.constvars, *(v for eqn in jaxpr.eqns for v in eqn.outvars)]
+    return any(jax.dtypes.issubdtype(getattr(v.aval, "dtype", float), kind) for v in some) or any(
+        comes_up(inner, kind) for eqn in jaxpr.eqns for inner in inner_jaxprs(eqn)
+    )
+
+
 def called(eqn: Any) -> ClosedJaxpr | None:
     """The jaxpr of an operation that only calls one, else None."""
     if eqn.primitive.name not in CALLS:

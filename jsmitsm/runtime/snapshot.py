@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm.runtime.compiled import fingerprint
-from jsmitsm.runtime.jaxprs import ClosedJaxpr, inner_jaxprs, jaxpr_as_fun
+from jsmitsm.runtime.jaxprs import ClosedJaxpr, comes_up, inner_jaxprs, jaxpr_as_fun
 from jsmitsm.runtime.tracers import is_traced
 
 # JAX looks up functions by their identity in caches of its own: not the one that it is given here, but those that this
@@ -39,6 +39,10 @@ def snapshot(function: Callable[..., Any], *arguments: Any) -> tuple[ClosedJaxpr
     if old:
         with _never_seen(object()):
             closed, shape = record()
+    if comes_up(closed.jaxpr, jax.dtypes.extended):
+        raise ValueError(
+            "random keys of JAX within a function are not followed; draw the numbers before, and let it read them"
+        )
     consts = [_own(c, v.aval.dtype) for c, v in zip(closed.consts, closed.jaxpr.constvars, strict=True)]
     return ClosedJaxpr(closed.jaxpr, consts), shape
 
@@ -55,9 +59,7 @@ def _of_arrays(jaxpr: Any) -> bool:
 
 
 def _own(const: Any, dtype: Any) -> Any:
-    if isinstance(const, jax.core.Tracer) or jax.dtypes.issubdtype(dtype, jax.dtypes.extended):
-        return const
-    return np.array(const, dtype)
+    return const if isinstance(const, jax.core.Tracer) else np.array(const, dtype)
 
 
 class ScalarFunction:

@@ -203,7 +203,7 @@ def _convert(ring: Ring, eqn: Any, x: Array) -> Array:
     return x.astype(dtype) if np.issubdtype(dtype, np.inexact) else x[:1].astype(dtype)
 
 
-@rule("copy", "copy_p", "stop_gradient", "reduce_precision", "optimization_barrier", "name", "real", "device_put")
+@rule("copy", "copy_p", "stop_gradient", "reduce_precision", "optimization_barrier", "name", "device_put")
 def _identity(ring: Ring, eqn: Any, *vals: Array) -> Any:
     # Expansion in x is no differentiation of the user's: stop_gradient does not stop it.
     return list(vals) if eqn.primitive.multiple_results else vals[0]

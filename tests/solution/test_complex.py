@@ -125,3 +125,19 @@ def test_what_is_refused():
     for ask, told in refused:
         with pytest.raises(ValueError, match=told):
             ask()
+
+
+@pytest.mark.parametrize("source, exact", [
+    (lambda x: ((2 + 1j) * jnp.exp(1j * x[0])).real, lambda x: (-(2 + 1j) * np.exp(1j * x)).real),
+    (lambda x: jnp.square(jnp.exp(1j * x[0]).real), lambda x: x**2 / 4 - np.cos(2 * x) / 8),
+    (lambda x: jnp.abs(jnp.exp((1 + 1j) * x[0])) + jnp.angle(jnp.asarray(1j)), lambda x: np.exp(x) + np.pi * x**2 / 4),
+])  # fmt: skip
+def test_complex_numbers_within_a_real_problem(source, exact):
+    """u'' = the source, and the same with it in front of u'': values, coefficients and conditions."""
+    ends = {"left": js.dirichlet(exact(0.0)), "right": js.dirichlet(exact(1.0))}
+    for pde in (
+        lambda u, x: js.laplacian(u)(x) - source(x),
+        lambda u, x: ((1 + 1j) * (2 + source(x)) * (js.laplacian(u)(x) - source(x))).imag,
+    ):
+        sol = js.solve(js.Problem(pde, ends), LINE, order=6)
+        assert abs(sol.u - exact(LINE.points[:, 0])).max() < 1e-11 and not sol.flags

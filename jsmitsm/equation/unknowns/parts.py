@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jsmitsm.runtime.jaxprs import Literal, bind, called
+from jsmitsm.runtime.jaxprs import Literal, bind, called, comes_up
 
 
 class Pair(NamedTuple):
@@ -68,7 +68,7 @@ def _done(eqn: Any, vals: list[Any]) -> Any:
     inner = called(eqn)
     holds = any(isinstance(v, Pair) for v in vals)
     makes = any(jnp.issubdtype(v.aval.dtype, jnp.complexfloating) for v in eqn.outvars)
-    if inner is not None and (holds or makes or _inside(inner)):
+    if inner is not None and (holds or makes or comes_up(inner.jaxpr, np.complexfloating)):
         return _evaluate(inner.jaxpr, inner.consts, vals[len(vals) - len(inner.jaxpr.invars) :])
     if not holds and not makes:
         out = bind(eqn, *vals)
@@ -84,10 +84,6 @@ def _done(eqn: Any, vals: list[Any]) -> Any:
         f"the operation {name} of JAX on complex numbers is not made for; write it with +, *, /, powers, exp, log, "
         "sqrt, sin, cos, sinh, cosh, real, imag, conj and abs, or by real and imaginary parts"
     )
-
-
-def _inside(inner: Any) -> bool:
-    return any(jnp.issubdtype(v.aval.dtype, jnp.complexfloating) for e in inner.jaxpr.eqns for v in e.outvars)
 
 
 def _pair(value: Any) -> Pair:
