@@ -828,6 +828,36 @@ def the_flags_of_an_array(patch, path):
 
 
 @way
+def one_array_by_two_names(patch, path):
+    k = np.ones(2)
+    names = [k, k]
+    return lambda: 1.0 if names[1] is names[0] else 2.0, lambda: names.__setitem__(1, k.copy())
+
+
+@way
+def how_numpy_prints(patch, path):
+    k = np.array([1.26])
+    options = np.get_printoptions()
+    patch.setattr(patch, "undo", lambda undo=patch.undo: (np.set_printoptions(**options), undo()))
+    return lambda: 1.0 if f"{k}" == "[1.26]" else 2.0, lambda: np.set_printoptions(precision=1)
+
+
+@way
+def what_numpy_raises(patch, path):
+    k, rules = np.zeros(1), np.seterr(divide="ignore")
+    patch.setattr(patch, "undo", lambda undo=patch.undo: (np.seterr(**rules), undo()))
+
+    def read():
+        try:
+            1.0 / k
+        except FloatingPointError:
+            return 2.0
+        return 1.0
+
+    return read, lambda: np.seterr(divide="raise")
+
+
+@way
 def a_masked_array(patch, path):
     k = np.ma.array([1.0, 2.0], mask=[False, True])
     return lambda: float(k.max()), lambda: setattr(k, "mask", False)
@@ -981,6 +1011,40 @@ def a_function_of_jax_replaced(patch, path):
         return 2.0
 
     return lambda: jnp.cos(0.0), lambda: patch.setattr(jnp, "cos", other)
+
+
+def _own_function_in_place(patch, make):
+    """A function of the user's, by the name of one of the library's, in a coat of the library's making."""
+
+    def square(x, y=None):
+        return K * x
+
+    patch.setattr(jnp, "square", make(square))
+    return _global(patch)
+
+
+@way
+def a_function_of_jax_replaced_by_a_mapped_one(patch, path):
+    change = _own_function_in_place(patch, jax.vmap)
+    return lambda: jnp.square(jnp.ones(1))[0], change
+
+
+@way
+def a_function_of_jax_replaced_by_a_ufunc(patch, path):
+    change = _own_function_in_place(patch, lambda square: jnp.frompyfunc(square, 2, 1))
+    return lambda: jnp.square(1.0, 1.0), change
+
+
+@way
+def an_attribute_of_a_function_of_jax(patch, path):
+    patch.setattr(jnp.where, "k", 1.0, raising=False)
+    return lambda: jnp.where.k, lambda: patch.setattr(jnp.where, "k", 2.0)
+
+
+@way
+def an_attribute_of_a_type_of_jax(patch, path):
+    patch.setattr(jnp.float64, "k", 1.0, raising=False)
+    return lambda: jnp.float64.k, lambda: patch.setattr(jnp.float64, "k", 2.0)
 
 
 @way

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import builtins
 import functools
+import locale
 import threading
 import types
 from collections import OrderedDict
@@ -56,13 +57,13 @@ def _value(value: Any, seen: dict[int, int]) -> Any:
         return kind, value.real.hex(), value.imag.hex()
     if kind is range:
         return kind, value.start, value.stop, value.step
-    if isinstance(value, jax.Array | np.ndarray | np.generic):
-        return _array(value)
     if stateless(value):
         return Same(value)
     if id(value) in seen:
         return "again", seen[id(value)]
     seen[id(value)] = len(seen)
+    if isinstance(value, jax.Array | np.ndarray | np.generic):
+        return _array(value)
     if kind in (tuple, list, set, frozenset):
         return kind, tuple(_value(v, seen) for v in value)
     if kind is dict:
@@ -117,6 +118,8 @@ def _global(function: types.FunctionType, name: str, looks: Lookups, seen: dict[
 
 def _looked_up(value: Any, chains: frozenset[tuple[str, ...]], seen: dict[int, int]) -> Any:
     """A value by itself; a module by those of its attributes that are read, and by nothing else."""
+    if isinstance(value, type) and any(chains):  # an attribute of a library's class may be of the user's
+        raise Unknown
     if type(value) is not types.ModuleType:
         return _value(value, seen)
     if () in chains:  # it is handed on, and may be asked for anything
@@ -135,10 +138,16 @@ _records: OrderedDict[Any, Any] = OrderedDict()
 _lock = threading.Lock()  # solves may run in several threads
 
 
+def _surroundings() -> Any:
+    """Settings that change what functions give: JAX's, numpy's for errors and texts, the locale's for numbers."""
+    numpys = *np.geterr().items(), *np.get_printoptions().items()
+    return tuple(getattr(jax.config, name) for name in _SETTINGS), numpys, locale.setlocale(locale.LC_NUMERIC)
+
+
 def _key(function: Callable[..., Any], rest: Any) -> Any:
     """What a record is kept under, or None where it is not kept."""
     try:
-        key = identity(function), rest, tuple(getattr(jax.config, name) for name in _SETTINGS)
+        key = identity(function), rest, _surroundings()
         hash(key)
     except (Unknown, TypeError, RecursionError):
         return None

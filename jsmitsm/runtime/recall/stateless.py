@@ -99,16 +99,30 @@ def _found(home: str, name: str, value: Any) -> bool:
 
 def _ours(value: Any) -> bool:
     """Whether it is of a library, and does not only stand there (as what a user put in a function's place)."""
-    if type(value) is types.FunctionType:
-        return not (_module_of(value) or "jsmitsm").startswith("jsmitsm")  # this package's are read as the user's are
     if type(value) is types.BuiltinFunctionType:
         return value.__self__ is None or type(value.__self__) is types.ModuleType
     if isinstance(value, type):
         return value.__module__.partition(".")[0] in (*_LIBRARIES, "builtins", "functools")
-    if type(value).__module__.partition(".")[0] not in _LIBRARIES:
+    if type(value) is types.FunctionType:
+        # This package's are read as the user's are.
+        home: str = _module_of(value) or "jsmitsm"
+    else:
+        home = type(value).__module__
+    if home.partition(".")[0] not in _LIBRARIES or home.startswith("jsmitsm"):
         return False
-    inner = getattr(value, "__wrapped__", None)  # of a jitted function
-    return inner is None or _ours(inner)
+    # What jax.vmap or np.vectorize make of a user's function holds it; what users wrote on a function is theirs, too.
+    kept = getattr(value, "__dict__", {})
+    if any(not name.startswith("_") and name not in getattr(type(value), "__annotations__", ()) for name in kept):
+        return False
+    return all(_ours(held) for held in _held(kept))
+
+
+def _held(kept: dict[str, Any]) -> Iterator[Any]:
+    """The functions among the attributes of a callable object."""
+    for name, part in kept.items():
+        for held in part.values() if type(part) is dict and name != "__annotations__" else (part,):
+            if callable(held) and not isinstance(held, type):
+                yield held
 
 
 def _module_of(function: types.FunctionType) -> str | None:
@@ -116,7 +130,8 @@ def _module_of(function: types.FunctionType) -> str | None:
     name = str(function.__globals__.get("__name__"))
     module = sys.modules.get(name)
     there = module is not None and vars(module) is function.__globals__
-    return name if there and name.partition(".")[0] in _LIBRARIES else None
+    written = there and getattr(module, "__file__", None) == function.__code__.co_filename
+    return name if written and name.partition(".")[0] in _LIBRARIES else None
 
 
 def of_library(value: Any) -> bool:
