@@ -43,9 +43,9 @@ _EFFORT = (
 )
 # Fits of so many columns are large.
 _LARGE = 28
-# Up to so many Taylor coefficients, or so many where all share an elimination, one kernel is faster than many and
-# a library's matrix products.
-_SMALL, _SMALL_SHARED = 32, 66
+# Up to so many Taylor coefficients, where all share an elimination, one kernel is faster than many and a library's matrix
+# products. Where each particle has its own, it is as often slower and takes up to twice as long to compile.
+_SMALL = 66
 
 # How often the local phase was compiled; read by the tests.
 TRACES = {"rows": 0, "coefficients": 0}
@@ -158,8 +158,8 @@ def _in_size_classes(function: Any) -> Any:
             by_row[names.index("operands")] = by_row[names.index("operands")]._replace(count=None)
             return cut(devices.side_by_side(function, scheme, arguments, dict(zip(names, by_row)), mesh), m)
         options = effort(size, len(fit_and_tail(scheme.rec)[0]))
-        most = _SMALL if operands.shared is None else _SMALL_SHARED
-        small = scheme.rec.size * scheme.rec.fields <= most and one_kernel.available()
+        few = operands.shared is not None and scheme.rec.size * scheme.rec.fields <= _SMALL
+        small = few and one_kernel.available()
         share = None if loose else dict(zip(names, _by_row(points, kernel, ids, neighbours, given, each, whole)))
         return cut(called(function, {"scheme": scheme}, arguments, tuple(options.items()), small, share), m)
 

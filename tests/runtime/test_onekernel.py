@@ -71,7 +71,7 @@ def test_the_local_phase_is_one_kernel(method, side, monkeypatch):
     monkeypatch.setattr(whole_program, "Program", Kept)
     whole_program._whole.cache_clear()
     cloud = js.rectangle((0, 0), (1, 1), (side, side), jitter=0.2)
-    posed = js.Problem(lambda u, x: (1 + x[0]) * js.laplacian(u)(x) - x[1], held(cloud, 0.0))
+    posed = js.Problem(lambda u, x: js.laplacian(u)(x) - x[1], held(cloud, 0.0))
     js.solve(posed, cloud, method=method, order=2)
     assert any("rows" in p.name for p in made) and all(p.small for p in made if not p.on_host)
 
@@ -86,7 +86,7 @@ def test_one_kernel_gives_the_numbers_of_many(method, dim, monkeypatch):
     cloud = clouds[dim - 1]
     exact = lambda x: jnp.sin(jnp.sum(x)) + x[0] ** 2
     posed = js.Problem(
-        lambda u, x: js.laplacian(u)(x) + (1 + x[0]) * u(x) - js.laplacian(exact)(x) - (1 + x[0]) * exact(x),
+        lambda u, x: js.laplacian(u)(x) + u(x) - js.laplacian(exact)(x) - exact(x),
         held(cloud, exact),
     )
     one = js.solve(posed, cloud, method=method, order=2 if method != "S" else 4).u
