@@ -20,7 +20,6 @@ from jsmitsm.discretization.held_particles import with_held_expansions
 from jsmitsm.discretization.layout import Class, Discretization, discretize, sorted_classes, table
 from jsmitsm.discretization.operator_kind import information_travels
 from jsmitsm.discretization.parts.whole import Part, Whole
-from jsmitsm.discretization.resolution.digits import LOOKED_AT
 from jsmitsm.discretization.rows import all_coefficients, all_rows
 from jsmitsm.equation.conditions import refuse_counts
 from jsmitsm.equation.problem import Problem
@@ -79,7 +78,7 @@ class Local:
         halo, s = self.halo, self.settings
         with self.team.phase(halo.slab.number):
             even = self._even()
-            self.part = Part(halo.own, even, self._spacing(), self._sample(), halo.slab.number, self.mine.count,
+            self.part = Part(halo.own, even, self._spacing(), halo.slab.number, self.mine.count, self._every,
                              self.team.largest, self.team.total, self.team.gather)  # fmt: skip
             cloud = halo.slab.cloud()
             kernel = s.kernel and local_kernel(s.kernel, halo.slab)
@@ -122,9 +121,8 @@ class Local:
         kept = kept_distances(slab.points, slab.points[at]) if len(at) else np.zeros(0)
         return is_even(np.concatenate(self.team.gather(kept)))
 
-    def _sample(self) -> np.ndarray:
-        """The particles by which one process judges the coefficients."""
-        step = max(1, self.mine.count // LOOKED_AT)
+    def _every(self, step: int) -> np.ndarray:
+        """Every ``step``-th particle of the whole cloud, in its order."""
         some = self.mine.number % step == 0
         found = self.team.gather((self.mine.number[some], self.mine.points[some]))
         number, points = (np.concatenate(parts) for parts in zip(*found))

@@ -36,16 +36,16 @@ _WIDE = 8192
 _ALONE: Any = {"xla_cpu_multi_thread_eigen": False}
 _PLAIN: Any = _ALONE | {"xla_cpu_use_fusion_emitters": False, "xla_cpu_parallel_codegen_split_count": 1}
 QUICKLY: Any = _PLAIN | {"xla_backend_optimization_level": 0}
-_EFFORT = (
+EFFORT = (
     (FEW, QUICKLY),
     (2048, _PLAIN | {"xla_backend_optimization_level": 1}),
     (np.inf, _ALONE),
 )
 # Fits of so many columns are large.
 _LARGE = 28
-# Up to so many Taylor coefficients, where all share an elimination, one kernel is faster than many and a library's matrix
-# products. Where each particle has its own, it is as often slower and takes up to twice as long to compile.
-_SMALL = 66
+# Up to so many Taylor coefficients, where all share an elimination, one kernel is faster than many and a library's
+# matrix products. Where each particle has its own, it is as often slower and takes up to twice as long to compile.
+SMALL = 66
 
 # How often the local phase was compiled; read by the tests.
 TRACES = {"rows": 0, "coefficients": 0}
@@ -105,7 +105,7 @@ def _first(x: np.ndarray, m: int) -> np.ndarray:
 
 def effort(size: int, columns: int = 0) -> Any:
     """The compiler's options for programs over so many particles, whose fits have so many columns."""
-    return on_cpu(next(some for most, some in _EFFORT if size + (columns >= _LARGE) <= most))
+    return on_cpu(next(some for most, some in EFFORT if size + (columns >= _LARGE) <= most))
 
 
 def _by_row(
@@ -158,7 +158,7 @@ def _in_size_classes(function: Any) -> Any:
             by_row[names.index("operands")] = by_row[names.index("operands")]._replace(count=None)
             return cut(devices.side_by_side(function, scheme, arguments, dict(zip(names, by_row)), mesh), m)
         options = effort(size, len(fit_and_tail(scheme.rec)[0]))
-        few = operands.shared is not None and scheme.rec.size * scheme.rec.fields <= _SMALL
+        few = operands.shared is not None and scheme.rec.size * scheme.rec.fields <= SMALL
         small = few and one_kernel.available()
         share = None if loose else dict(zip(names, _by_row(points, kernel, ids, neighbours, given, each, whole)))
         return cut(called(function, {"scheme": scheme}, arguments, tuple(options.items()), small, share), m)

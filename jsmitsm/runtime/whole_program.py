@@ -34,7 +34,7 @@ from jsmitsm.runtime.tracers import is_traced, recorded
 
 # Options as pairs; None: f runs as it stands, in numpy, and its derivatives are compiled with little effort.
 Options = tuple[tuple[str, Any], ...] | None
-_LITTLE: Any = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 1}
+LITTLE: Any = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 1}
 _KEPT = 1024
 # Rows that are worth a core of their own.
 _WORTH = 1000
@@ -171,7 +171,7 @@ class Program:
 
         part.__name__ = name
         if options is None:
-            options = tuple(on_cpu(_LITTLE).items())
+            options = tuple(on_cpu(LITTLE).items())
         function.__name__ = name
         if base:
             function = _to_be_run(function)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from jsmitsm.discretization.parts.whole import ALONE, Part, Whole
+from jsmitsm.discretization.resolution import turning
 from jsmitsm.linear.conditioning import inverse_norm
 from jsmitsm.parallel.look.conditioning import Entries
 from jsmitsm.parallel.team import Team
@@ -50,11 +51,17 @@ def together(ask):
     return found
 
 
-def parted(team, count, owner):
+def parted(team, count, owner, points=None):
     """The whole as a part sees it, which knows every second particle of the others too."""
     number = np.flatnonzero((owner == team.rank) | (np.arange(count) % 2 == 0))
+    mine = np.flatnonzero(owner == team.rank)
+
+    def every(step):
+        at = np.concatenate(team.gather(mine[mine % step == 0]))
+        return points[np.sort(at)]
+
     own = owner[number] == team.rank
-    return number, Whole(Part(own, True, 1.0, np.zeros((0, 2)), number, count, team.largest, team.total, team.gather))
+    return number, Whole(Part(own, True, 1.0, number, count, every, team.largest, team.total, team.gather))
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -79,6 +86,26 @@ def test_parts_tell_what_one_process_tells(seed):
         # Between two numbers one interpolates, and rounds.
         np.testing.assert_allclose(ranks, alone[0], rtol=1e-15)
         assert tuple(rest) == alone[1:]
+
+
+def test_what_tells_the_depth_is_that_of_one_process(monkeypatch):
+    monkeypatch.setattr(turning, "MOST", 70)  # so that only every third particle is asked for its neighbours
+    rng = np.random.default_rng(2)
+    points, owner = rng.uniform(size=(200, 2)), rng.integers(0, SIZE, 200)
+    held = rng.choice(200, 30, replace=False)
+
+    def ask(team):
+        number, told = parted(team, 200, owner, points)
+        free = turning._free(points[number], [np.flatnonzero(np.isin(number, held))], told.part)
+        return *turning._sample(points[number], 12, told.part), np.sort(free, axis=0)
+
+    sample, radius = turning._sample(points, 12, None)
+    free = turning._free(points, [held], None)
+    assert radius is not None and len(sample) == 100 and len(free) == 170
+    for found in together(ask):
+        np.testing.assert_array_equal(found[0], sample)
+        assert found[1] == radius
+        np.testing.assert_array_equal(found[2], np.sort(free, axis=0))
 
 
 def test_the_norm_of_an_inverse_is_that_of_one_process():

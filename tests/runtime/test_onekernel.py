@@ -60,7 +60,7 @@ def test_an_operation_that_no_kernel_holds_takes_many():
 
 @needs_one_kernel
 @pytest.mark.parametrize("side, method", [*((9, m) for m in METHODS), (50, "S"), (50, "II")])
-def test_the_local_phase_is_one_kernel(method, side, monkeypatch):
+def test_the_local_phase_is_one_kernel(method, side, monkeypatch, usual_effort):
     made = []
 
     class Kept(whole_program.Program):
@@ -81,7 +81,7 @@ def held(cloud, value):
 
 
 @pytest.mark.parametrize("dim, method", [*((1, m) for m in METHODS), (2, "S"), (2, "I"), (3, "S")])
-def test_one_kernel_gives_the_numbers_of_many(method, dim, monkeypatch):
+def test_one_kernel_gives_the_numbers_of_many(method, dim, monkeypatch, usual_effort):
     clouds = js.interval(0, 1, 30), js.rectangle((0, 0), (1, 1), (9, 9)), js.box((0, 0, 0), (1, 1, 1), (5, 5, 5))
     cloud = clouds[dim - 1]
     exact = lambda x: jnp.sin(jnp.sum(x)) + x[0] ** 2

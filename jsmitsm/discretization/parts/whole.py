@@ -14,17 +14,17 @@ class Part:
     """A part of a cloud that several processes share: what is decided of the whole, and how they decide together.
 
     own (n,) bool: the particles whose rows are made here, the others are only looked at. even: whether the whole cloud
-    is evenly spaced; spacing: the mean one of the whole; sample (m, D): some of its particles. number (n,): of all
-    particles here in the whole cloud of ``count``. largest: of numbers by name the largest of all parts; total: the sum
-    of an array over all parts; gather: what each part gives; they are called by all of them at once.
+    is evenly spaced; spacing: the mean one of the whole. number (n,): of all particles here in the whole cloud of
+    ``count``. every: of a step k every k-th particle of the whole; largest: of numbers by name the largest of all
+    parts; total: the sum of an array over all parts; gather: what each part gives; all of them call these at once.
     """
 
     own: np.ndarray
     even: bool
     spacing: float
-    sample: np.ndarray
     number: np.ndarray
     count: int
+    every: Callable[[int], np.ndarray]
     largest: Callable[[dict[Any, Any]], dict[Any, Any]]
     total: Callable[[Any], Any]
     gather: Callable[[Any], list[Any]]
@@ -39,6 +39,10 @@ class Whole:
     def own(self, values: Any) -> Any:
         """Of values (n, ...) of all particles here those of the own ones."""
         return values if self.part is None else values[self.part.own]
+
+    def every(self, points: np.ndarray, step: int) -> np.ndarray:
+        """Of the particles ``points`` here every ``step``-th of the whole cloud, in its order."""
+        return points[::step] if self.part is None else self.part.every(step)
 
     def owned(self, ids: np.ndarray, values: Any) -> Any:
         """Of values (..., n or 1) at the particles ``ids`` (n,) those of own ones."""

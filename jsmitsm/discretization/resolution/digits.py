@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from jsmitsm.cloud.cloud import Cloud, kept
-from jsmitsm.discretization.parts.whole import Part
+from jsmitsm.discretization.parts.whole import Part, Whole
 from jsmitsm.discretization.resolution.turning import USUAL, few, turning
 from jsmitsm.equation.traced import Traced
 from jsmitsm.particle.recursion import Recursion
@@ -106,10 +106,10 @@ def _peclet(rec: Recursion, traced: Traced, cloud: Cloud, params: Any, part: Par
     if rec.orders[0] != 2 or not (drift and second) or points is None or not traced.linear or is_traced(params):
         return 0.0
     points = np.asarray(points)
-    spacing = float((np.prod(np.ptp(points, axis=0)) / len(points)) ** (1.0 / rec.dim))
-    sample = points[:: max(1, len(points) // LOOKED_AT)]
+    n, spacing = len(points), float((np.prod(np.ptp(points, axis=0)) / len(points)) ** (1.0 / rec.dim))
     if part is not None:
-        sample, spacing = part.sample, part.spacing
+        n, spacing = part.count, part.spacing
+    sample = Whole(part).every(points, max(1, n // LOOKED_AT))
     jac = traced.leading(sample, params)
     if is_traced(jac):
         return 0.0

@@ -11,7 +11,7 @@ import numpy as np
 
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.cloud.neighbours import reaches
-from jsmitsm.discretization.parts.whole import Part
+from jsmitsm.discretization.parts.whole import Part, Whole
 from jsmitsm.discretization.supports import default_size
 from jsmitsm.equation.traced import Traced
 from jsmitsm.particle.elimination import Scheme
@@ -56,15 +56,13 @@ def turning(
         return None
     if is_traced(traced, params):  # what only carries derivatives changes nothing
         traced, params = jax.tree.map(concrete, (traced, params))
-    sample, radius = _sample(np.asarray(points), default_size(Scheme("S", rec), True), part)
+    points = np.asarray(points)
+    sample, radius = _sample(points, default_size(Scheme("S", rec), True), part)
     if radius is None:
         return None
     degree = DEGREE
-    if part is None and few(traced, cloud, part):  # the very series that are used afterwards, and remembered until then
-        free = np.ones(len(cloud), bool)
-        for ids in held:
-            free[ids] = False
-        sample, degree = np.asarray(points)[free], rec.degree + USUAL
+    if few(traced, cloud, part):  # the very series that are used afterwards, and remembered until then
+        sample, degree = _free(points, held, part), rec.degree + USUAL
     jac, residual = traced.coefficients(sample, degree, params=params)
     source = np.zeros(2) if residual is None else _sizes(rec.dim, np.asarray(residual)[0], radius)
     lower = np.array([rec.orders[0] - sum(b) for _, b in rec.slots])
@@ -87,14 +85,20 @@ def few(traced: Traced, cloud: Cloud, part: Part | None) -> bool:
 
 def _sample(points: np.ndarray, size: int, part: Part | None) -> tuple[np.ndarray, float | None]:
     """Some particles, and the radius of the supports of this size; None where they differ."""
-    dim = points.shape[1]
-    if part is not None:
-        ball = math.pi ** (dim / 2) / math.gamma(dim / 2 + 1)
-        return part.sample, part.spacing * (size / ball) ** (1.0 / dim)
-    sample, every = points[:: -(-len(points) // LOOKED_AT)], -(-len(points) // MOST)
-    radius = reaches(points[::every], sample[::2], size) / every ** (1.0 / dim)
+    n = len(points) if part is None else part.count
+    every = lambda step: Whole(part).every(points, step)
+    sample, step = every(-(-n // LOOKED_AT)), -(-n // MOST)
+    radius = reaches(every(step), sample[::2], size) / step ** (1.0 / points.shape[1])
     middle = float(np.median(radius))
     return sample, middle if radius.max() < EVEN * middle else None
+
+
+def _free(points: np.ndarray, held: list[np.ndarray], part: Part | None) -> np.ndarray:
+    """All particles of the whole cloud whose values are not given."""
+    free = np.ones(len(points), bool)
+    for ids in held:
+        free[ids] = False
+    return points[free] if part is None else np.concatenate(part.gather(points[free & part.own]))
 
 
 def _sizes(dim: int, series: np.ndarray, radius: float) -> tuple[float, float]:
