@@ -19,7 +19,6 @@ import numpy as np
 import pytest
 
 from jsmitsm.particle import batches
-from jsmitsm.runtime import whole_program
 
 jax.config.update("jax_enable_x64", True)
 
@@ -27,7 +26,6 @@ jax.config.update("jax_enable_x64", True)
 # test_onekernel.py has. Processes of their own (notebooks, users' scripts) have the usual effort there.
 USUAL = {"EFFORT": batches.EFFORT, "SMALL": batches.SMALL}
 batches.EFFORT, batches.SMALL = ((np.inf, batches.QUICKLY),), 0
-whole_program.LITTLE["xla_backend_optimization_level"] = 0
 
 
 @pytest.fixture
