@@ -23,7 +23,11 @@ def edges(cloud: Cloud) -> np.ndarray:
         group[ids] = k
     turned = (group[rim][near] != group[rim][:, None]).any(axis=1)
     if cloud.normals is not None:
-        normals = np.asarray(cloud.normals, float)[rim][near[:, 1:]]
-        turned |= np.einsum("nad,nbd->nab", normals, normals).min(axis=(1, 2)) < _TURNED
+        turned |= turns(np.asarray(cloud.normals, float)[rim][near[:, 1:]])
     found[rim[turned]] = True
     return found
+
+
+def turns(normals: np.ndarray) -> np.ndarray:
+    """Whether normals (N, k, D) are of more than one side, (N,)."""
+    return np.einsum("nad,nbd->nab", normals, normals).min(axis=(1, 2)) < _TURNED

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from jsmitsm.adaptation.spacing_field import SpacingField
 from jsmitsm.cloud.cloud import Cloud
@@ -31,6 +32,12 @@ def made(make: Make, spacing: Any) -> Cloud:
             "function (M, D) -> (M,), as in lambda spacing: js.from_polygon(vertices, spacing)"
         )
     return cloud
+
+
+def farther_than_asked(cloud: Cloud, spacing: SpacingField) -> float:
+    """How many times the spacing particles are apart at most: makers may not know how to be finer, or not want to."""
+    points = np.asarray(cloud.points)
+    return float((cKDTree(points).query(points, k=[2])[0][:, 0] / spacing(points)).max())
 
 
 def first_cloud(make: Make, start: Any) -> tuple[Cloud, SpacingField]:

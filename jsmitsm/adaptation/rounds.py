@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import time
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from jsmitsm.adaptation.data import Data, data_of, unresolved
 from jsmitsm.adaptation.edges import edges
-from jsmitsm.adaptation.first_cloud import Make, made
+from jsmitsm.adaptation.first_cloud import Make, farther_than_asked, made
+from jsmitsm.adaptation.free_ends import off_at_free_ends
 from jsmitsm.adaptation.layers import layers
 from jsmitsm.adaptation.marking import ROUGH, SLOW, Marks, marks, next_spacing
 from jsmitsm.adaptation.measure import Measured, Quantity, gaps, measured, size
@@ -52,8 +53,20 @@ _GROWTH, _SMALL, _LEAST, _LARGE, _PUSHED = 5.0, {1: 400, 2: 1500, 3: 3000}, 1.5,
 _PART, _DEGREE = 0.05, 4
 # After so many rounds without a smaller error by this factor the search ends.
 _STALLED, _BETTER = 3, 0.7
+# A round before with less than this part of the last one's error is what is handed out.
+_BACK = 0.1
+# Makers leave particles so many times the spacing apart that they were asked for, and no more.
+_ASKED = 3.0
 # From this part of the distance to it on, the error of the solve that checks explains the distance.
 _OTHERS = 0.5
+
+
+class Ended(NamedTuple):
+    """What a round leaves to be handed out, should none do better."""
+
+    error: float
+    solution: Solution
+    number: float | None
 
 
 class Rounds:
@@ -67,6 +80,7 @@ class Rounds:
         self.max_particles, self.max_rounds, self.options, self.wanted_order = max_particles, max_rounds, options, order
         self.clock = began
         self.solution: Solution = None  # type: ignore[assignment]
+        self.spacing: SpacingField = None  # type: ignore[assignment]
         self.error, self.reached = np.inf, False
         self.undoubted = np.inf  # the error without the doubt where smoothness ends, which marking has as well
         self.number: float | None = None
@@ -79,6 +93,9 @@ class Rounds:
         self.before: Marks | None = None
         self.best: tuple[int, float, SpacingField] | None = None  # order, error and spacing of the best round so far
         self.apart: np.ndarray | None = None  # gaps between neighbours, where they are what is wrong
+        self.least_error: Ended | None = None
+        self.lowered: tuple[int, float] | None = None  # order and error before the order was lowered
+        self.hopeful = False  # whether that was no remedy, and more particles are what is left
 
     def history(self) -> dict[str, np.ndarray]:
         names = ("particles", "order", "error", "seconds", "smallest")
@@ -87,6 +104,14 @@ class Rounds:
     # ------------------------------------------------------------------ the loop
 
     def run(self, cloud: Cloud, spacing: SpacingField, shown: Any) -> None:
+        self._search(cloud, spacing, shown)
+        best = self.least_error
+        if not self.reached and best is not None and best.error < _BACK * self.error and not best.solution.flags:
+            self.messages.append(f"The last round was worse, {self.error:.1e}: this is the best one.")
+            self.error, self.solution, self.number = best
+            self.flags = []
+
+    def _search(self, cloud: Cloud, spacing: SpacingField, shown: Any) -> None:
         self.data = data_of(self.problem, cloud.dim, _DEGREE)
         if self.data is not None:
             self.least = max(self.data.traced.order)
@@ -109,6 +134,8 @@ class Rounds:
             shown.reach(spent(self.history(), self.tol))
             shown.note(f"round {number + 1}, {len(cloud)} particles, error {found.error:.1e} of {self.tol:g}")
             done = self._done(sol, found, cloud, spacing)
+            if self.least_error is None or self.error < self.least_error.error:
+                self.least_error = Ended(self.error, sol, found.number)
             self._clocked()
             if done:
                 shown.reach(1.0)
@@ -127,6 +154,12 @@ class Rounds:
     def _limit(self, what: str) -> None:
         between = "" if self.apart is None else " at the particles, more between them"
         self.messages.append(f"Not reached: the error is estimated at {self.error:.1e}{between}; limited by {what}.")
+        coarser = farther_than_asked(self.solution.cloud, self.spacing)
+        if coarser > _ASKED:
+            self.messages.append(
+                f"The cloud's maker leaves particles up to {coarser:.0f} times as far apart as the spacing it was given; "
+                "it must keep to that spacing everywhere."
+            )
         if self.solution is not None and not self.flags:
             self.flags = self.solution.flags
 
@@ -138,7 +171,8 @@ class Rounds:
         now = time.perf_counter()
         self.rows.append((len(cloud), order, found.error, now - self.clock, float(h.min())))
         self.clock = now
-        self.solution, self.error, self.undoubted = sol, found.error, found.error
+        self.spacing, self.solution = spacing, sol
+        self.error = self.undoubted = found.error
         self.number_before, self.number = self.number, found.number
         return sol, found
 
@@ -170,8 +204,12 @@ class Rounds:
         wanted = next(order for limit, order in ladder if self.tol >= limit)
         if not self.rows or self.rows[-1][2] > ROUGH:
             wanted = min(wanted, ladder[0][1])
-        if len(self.rows) > 1 and self.rows[-1][2] > max(ROUGH, _HOPE * self.rows[-2][2]):
+        *_, last = self.rows or [(0, 0, 0.0)]
+        if self.lowered is not None and last[1] < self.lowered[0] and last[2] > self.lowered[1]:
+            self.highest, self.shallow, self.hopeful = self.lowered[0], False, True
+        elif len(self.rows) > 1 and last[2] > max(ROUGH, _HOPE * self.rows[-2][2]) and not self.hopeful:
             # More particles do not help: Taylor polynomials of something that is not smooth, the fewer the better.
+            self.lowered = last[1], last[2]
             self.highest, self.shallow = min(self.highest, max(self.rows[-1][1] - 2, self.least)), True
         return max(min(wanted, self.highest), self.least)
 
@@ -213,8 +251,9 @@ class Rounds:
             return False
         self._checked(sol, found, cloud, spacing)
         self.flags = sol.flags
-        apart = gaps(sol) if self.quantity is None and self.norm == "max" and sol.defects else None
-        self.apart = None
+        self.apart, apart = None, None
+        if self.quantity is None and self.norm == "max" and sol.defects:
+            apart = self._parts(sol, found, cloud, spacing)
         if apart is not None and found.scale > 0:
             between = float(apart.max()) / found.scale / _GAP
             if between > self.tol:
@@ -225,6 +264,17 @@ class Rounds:
         self.error = max(self.undoubted, self._doubted(found, cloud, spacing))
         self.reached = self.error <= self.tol and not self.flags and self.apart is None
         return self.reached
+
+    def _parts(self, sol: Solution, found: Measured, cloud: Cloud, spacing: SpacingField) -> np.ndarray | None:
+        """What parts neighbours between them, or may part them from what is true, (N,)."""
+        known = self.before is not None
+        off = off_at_free_ends(
+            self.problem, cloud, np.asarray(sol.u).reshape(len(cloud), -1),
+            self._marks(found, cloud, spacing).rate < SLOW if known else None,
+            self.before.points if known else None,
+        )  # fmt: skip
+        apart = gaps(sol)
+        return np.maximum(_GAP * off, 0.0 if apart is None else apart) if off.any() else apart
 
     def _doubted(self, found: Measured, cloud: Cloud, spacing: SpacingField) -> float:
         """The error where smoothness ends, of which the estimate sees a part."""
@@ -313,6 +363,9 @@ class Rounds:
                 break
         else:
             self._limit("the cloud's maker, which refused finer ones")
+            return None
+        if len(following) == len(cloud) and np.array_equal(following.points, points):
+            self._limit("the cloud's maker, which made the same particles again for another spacing")
             return None
         return field, following
 

@@ -9,6 +9,7 @@ import jsmitsm as js
 from jsmitsm.adaptation.data import data_of, unresolved
 from jsmitsm.adaptation.edges import edges
 from jsmitsm.adaptation.first_cloud import first_cloud
+from jsmitsm.adaptation.free_ends import off_at_free_ends
 from jsmitsm.adaptation.layers import layers
 from jsmitsm.adaptation.marking import Marks, marks, next_spacing
 from jsmitsm.adaptation.measure import Measured
@@ -114,6 +115,9 @@ def test_what_limits_is_said():
     few = js.adapt(problem, line, 1e-10, order=2, depth=0, max_particles=40)
     assert not few.reached and few.error > 1e-10 and len(few.cloud) <= 40
     assert any("max_particles" in line for line in few.messages)
+    stiff = lambda spacing: js.interval(0.0, 1.0, 20) if callable(spacing) else line(spacing)
+    same = js.adapt(problem, stiff, 1e-10, order=2, depth=0, start=0.05)
+    assert not same.reached and len(same.history["particles"]) == 2 and "same particles again" in same.messages[0]
     short = js.adapt(problem, line, 1e-10, order=2, depth=0, max_rounds=1)
     assert not short.reached and any("max_rounds" in line for line in short.messages)
 
@@ -245,6 +249,25 @@ def test_a_singular_point_beside_an_edge_is_the_edge():
     assert marks(points, np.full(len(points), 0.07), 0.9 * eta, 5.0, first).singular[beside]
 
 
+def test_where_a_side_stops_being_held_the_values_are_in_doubt():
+    """r^(1/2) sin(t / 2), free left of 0 and held right of it: no particle of the side is where that changes."""
+    free = lambda x: (x[:, 1] < 1e-12) & (x[:, 0] < 0) & (x[:, 0] > -1)
+    groups = {"free": free, "held": lambda x: ~free(x)}
+    cloud = js.from_polygon([(-1, 0), (1, 0), (1, 1), (-1, 1)], 0.13, groups=groups)
+    bcs = {"free": js.neumann(0.0), "held": js.dirichlet(0.0)}
+    x = np.asarray(cloud.points)
+    r, t = np.hypot(*x.T), np.arctan2(x[:, 1], x[:, 0])
+    values = (np.sqrt(r) * np.sin(t / 2))[:, None]
+    off = lambda bcs, *told: off_at_free_ends(js.Problem(lambda u, x: js.laplacian(u)(x), bcs), cloud, values, *told)
+    first = off(bcs, None, None)
+    assert first.max() > 0.01 and r[first > 0].max() < 0.3  # not the corners at -1, where it changes too
+    everywhere = np.ones(len(x), bool)
+    vertex, moved = off(bcs, everywhere, x)[r < 0.3].max(), off(bcs, everywhere, x + 1e-3)[r < 0.3].max()
+    assert moved == pytest.approx(vertex / 0.35)
+    assert not off(bcs, ~everywhere, x).any()
+    assert not off({"free": js.dirichlet(0.0), "held": js.dirichlet(0.0)}, everywhere, x).any()
+
+
 def test_rounds_of_two_orders_tell_no_rates():
     """Contributions that only fell by half as the order grew are not those of a point where smoothness ends."""
     search, cloud = a_search(), js.interval(0.0, 1.0, 101)
@@ -269,6 +292,26 @@ def test_rounds_do_not_undo_each_other():
 
 def a_search(tol=1e-3):
     return Rounds(GOOD, line, tol, "auto", None, "max", 1000, 9, {}, 0.0)
+
+
+def test_the_best_round_is_handed_out():
+    """Beyond round-off every finer cloud is worse."""
+    problem = js.Problem(lambda u, x: js.laplacian(u)(x) - x[0], ends(0.0, 0.0))
+    found = js.adapt(problem, line, 1e-17, order=4)
+    errors = found.history["error"]
+    assert not found.reached and found.error == errors.min() < 0.1 * errors[-1]
+    assert true_error(found, lambda x: (x[0] ** 3 - x[0]) / 6) < 1e-14 and "the best one" in found.diagnose()
+
+
+def test_a_lower_order_that_does_worse_is_given_up():
+    search, cloud = a_search(), js.interval(0.0, 1.0, 11)
+    search.rows = [(10, 4, 3.0, 0.0, 0.1), (20, 4, 1.6, 0.0, 0.1)]
+    search.least = 2
+    assert search._order(cloud) == 2 and search.shallow
+    search.rows.append((40, 2, 100.0, 0.0, 0.1))
+    assert search._order(cloud) == 4 and not search.shallow
+    search.rows.append((80, 4, 90.0, 0.0, 0.1))
+    assert search._order(cloud) == 4
 
 
 def test_numbers_that_move_more_than_was_thought_are_not_believed():
