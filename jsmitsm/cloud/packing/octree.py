@@ -91,8 +91,9 @@ def refine(
         left.append(_take(cells, ~wanted))
         done.append(_take(cells, wanted & (width <= fraction * h * (1 + 1e-9))))
         split = wanted & (width > fraction * h * (1 + 1e-9))
-        # Near the boundary a split cell leaves about 2^(D - 1) behind, inside 2^D.
-        needed = float(((width / (fraction * h[split])) ** (dim if inside else dim - 1)).sum())
+        # Near the boundary a split cell leaves about 2^(D - 1) behind, inside 2^D. The foot of all that is beyond a
+        # corner is the corner: where only this point is fine most of the cell is not, so no cell counts for too many.
+        needed = float(np.minimum((width / (fraction * h[split])) ** (dim if inside else dim - 1), _MOST / 1000).sum())
         if needed > _MOST:
             raise ValueError(
                 f"spacing: as small as {h[split].min():.3g} in a domain of size {(hi - lo).max():.3g} it takes about "
