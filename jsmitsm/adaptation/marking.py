@@ -23,6 +23,8 @@ _NOTHING = 1e-4
 _ROUGH, SLOW, _SLOWEST = 0.6, 2.0, 0.35
 # Rates are read where the spacing changed by this factor, and smoothed over so many particles.
 _CHANGED, _AROUND = 1.3, 6
+# A contribution of so many times the median stands out, and is expected to fall with this power.
+_STARK, _SUSPECTED = 300.0, 1.0
 # Where the spacing changed by this factor, only particles within so many spacings of an old one are compared with it.
 _FRESH, _BESIDE = 0.15, 3.0
 # Contributions are taken from the largest of so many nearest particles. A singular point is one of so many that are
@@ -86,6 +88,12 @@ def marks(
     worst = (contribution > 0) & (contribution >= contribution[near].max(axis=1)) & (rate < min(SLOW, _ROUGH * power))
     at = _middle(contribution[near], away / spacing[:, None], near, edge)[worst]
     np.minimum.at(rate, at, rate[worst])
+    if before is None and edge is not None:
+        # No rates yet: what stands out at an edge is taken for its end of smoothness, and one round more tells.
+        stark = contribution >= _STARK * max(float(np.median(contribution)), 1e-300)
+        at = _middle(contribution[near], away / spacing[:, None], near, edge)[stark]
+        at = at[edge[at]]
+        rate[at] = _SUSPECTED
     singular, located = _singular(points, spacing, np.unique(at), before)
     return Marks(points, spacing, largest, np.clip(rate, _SLOWEST, power), singular, located)
 

@@ -115,3 +115,16 @@ def test_graded_parts_are_the_whole():
     every = np.concatenate([whole, rim])
     gap = np.sort(np.linalg.norm(every[None, :400] - every[:, None], axis=2), axis=0)[1]
     assert (gap > 0.75 * spacing(every[:400])).all()
+
+
+def test_a_convex_corner_may_be_fine():
+    """All of the outside near it has its foot there, at a spacing that no more of it needs."""
+    square = [(0, 0), (1, 0), (1, 1), (0, 1)]
+    graded = lambda x: np.minimum(0.1, 1e-8 + np.hypot(*x.T) / 4)
+    cloud = js.from_polygon(square, graded)
+    assert len(cloud) < 2500
+    x = np.asarray(cloud.points)
+    away = np.sort(np.hypot(*x.T))
+    assert away[0] == 0 and away[1] < 3e-8
+    with pytest.raises(ValueError, match="takes about"):
+        js.from_sdf(PLATE, ((0, 0), (2, 1)), lambda x: np.full(len(x), 1e-7))
