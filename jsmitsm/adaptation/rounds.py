@@ -13,7 +13,7 @@ from jsmitsm.adaptation.first_cloud import Make, farther_than_asked, made
 from jsmitsm.adaptation.free_ends import off_at_free_ends
 from jsmitsm.adaptation.layers import layers
 from jsmitsm.adaptation.marking import ROUGH, SLOW, Marks, marks, next_spacing
-from jsmitsm.adaptation.measure import Measured, Quantity, gaps, measured, size
+from jsmitsm.adaptation.measure import Measured, Quantity, gaps, measured, size, spent
 from jsmitsm.adaptation.spacing_field import SpacingField
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.equation.problem import Problem
@@ -157,8 +157,8 @@ class Rounds:
         coarser = farther_than_asked(self.solution.cloud, self.spacing)
         if coarser > _ASKED:
             self.messages.append(
-                f"The cloud's maker leaves particles up to {coarser:.0f} times as far apart as the spacing it was given; "
-                "it must keep to that spacing everywhere."
+                f"The cloud's maker leaves particles up to {coarser:.0f} times as far apart as it was asked to; it "
+                "must keep to its spacing everywhere."
             )
         if self.solution is not None and not self.flags:
             self.flags = self.solution.flags
@@ -204,7 +204,7 @@ class Rounds:
         wanted = next(order for limit, order in ladder if self.tol >= limit)
         if not self.rows or self.rows[-1][2] > ROUGH:
             wanted = min(wanted, ladder[0][1])
-        *_, last = self.rows or [(0, 0, 0.0)]
+        last = self.rows[-1] if self.rows else (0, 0, 0.0, 0.0, 0.0)
         if self.lowered is not None and last[1] < self.lowered[0] and last[2] > self.lowered[1]:
             self.highest, self.shallow, self.hopeful = self.lowered[0], False, True
         elif len(self.rows) > 1 and last[2] > max(ROUGH, _HOPE * self.rows[-2][2]) and not self.hopeful:
@@ -267,12 +267,9 @@ class Rounds:
 
     def _parts(self, sol: Solution, found: Measured, cloud: Cloud, spacing: SpacingField) -> np.ndarray | None:
         """What parts neighbours between them, or may part them from what is true, (N,)."""
-        known = self.before is not None
-        off = off_at_free_ends(
-            self.problem, cloud, np.asarray(sol.u).reshape(len(cloud), -1),
-            self._marks(found, cloud, spacing).rate < SLOW if known else None,
-            self.before.points if known else None,
-        )  # fmt: skip
+        before, values = self.before, np.asarray(sol.u).reshape(len(cloud), -1)
+        slow = None if before is None else self._marks(found, cloud, spacing).rate < SLOW
+        off = off_at_free_ends(self.problem, cloud, values, slow, None if before is None else before.points)
         apart = gaps(sol)
         return np.maximum(_GAP * off, 0.0 if apart is None else apart) if off.any() else apart
 
@@ -386,27 +383,6 @@ class Rounds:
             return self.best[2]
         self.best = (order, error, spacing) if error < ROUGH else None
         return None
-
-
-def spent(history: dict[str, np.ndarray], tol: float) -> float:
-    """The part of a search's time that is spent, about: the last two rounds tell how the error falls with particles.
-
-    Rounds to come have the last one's seconds a particle, and grow as the last one did; one that checks is as the last.
-
-    >>> rows = {"particles": [100, 400], "error": [1e-1, 1e-2], "seconds": [1.0, 2.0]}
-    >>> round(spent({name: np.array(row) for name, row in rows.items()}, 1e-3), 2)
-    0.27
-    """
-    count, error, seconds = (history[name] for name in ("particles", "error", "seconds"))
-    gone = seconds.sum()
-    if error[-1] <= tol:
-        return float(gone / (gone + seconds[-1]))
-    if len(count) < 2 or not (count[-1] > count[-2] and error[-1] < error[-2] < np.inf):
-        return 0.0
-    growth = count[-1] / count[-2]
-    more = np.log(error[-1] / tol) / np.log(error[-2] / error[-1])  # rounds to come, and parts of one
-    rest = seconds[-1] * growth * (growth**more - 1.0) / (growth - 1.0)
-    return float(gone / (gone + rest))
 
 
 def _refinable(error: Exception) -> bool:
