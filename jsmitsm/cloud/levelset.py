@@ -138,7 +138,8 @@ def checked(region: SdfRegion, boundary: Boundary) -> Boundary:
     if len(off):
         raise ValueError(
             f"sdf: {len(off)} boundary points could not be brought to its zero level, e.g. sdf = {value[off[0]]:.3g} "
-            f"at {boundary.points[off[0]]}; the function must be continuous and cross zero with a slope"
+            f"at {boundary.points[off[0]]}; the function must be continuous and cross zero with a slope, and its parts "
+            "must not touch in a point: move them apart by a spacing, or let them cross"
         )
     return boundary
 

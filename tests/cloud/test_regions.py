@@ -12,6 +12,7 @@ from jsmitsm.solution.regions.located import located
 BOX = ((-1.0, -1.0), (1.0, 1.0))
 DISK = js.sdf.circle((0.1, 0.0), 0.5)
 AROUND = js.sdf.difference(js.sdf.rectangle(*BOX), DISK)
+TANGENT = js.sdf.circle((-0.4, 0.0), 0.4), js.sdf.circle((0.4, 0.0), 0.4)
 
 
 def corners(x0, y0, x1, y1):
@@ -69,6 +70,22 @@ def test_where_three_regions_meet_each_has_a_copy_and_every_pair_its_own_normal(
     assert np.abs(cloud.normals[end] - [0, 1]).max() < 1e-6
 
 
+@pytest.mark.parametrize("first", ["in", "out"])
+def test_a_curve_ends_on_the_boundary_where_the_other_shape_touches_zero(first):
+    """A half disk on a side of the box: the difference of the two is zero all along that piece of the side."""
+    half = js.sdf.intersection(js.sdf.circle((-1.0, 0.0), 0.5), js.sdf.rectangle(*BOX))
+    shapes = {"in": half, "out": js.sdf.difference(js.sdf.rectangle(*BOX), half)}
+    cloud = js.regions({n: shapes[n] for n in (first, *(set(shapes) - {first}))}, BOX, 0.2)
+    (pairs,) = cloud.interfaces.values()
+    at = cloud.points[pairs[:, 0]]
+    assert np.abs(np.linalg.norm(at + [1.0, 0.0], axis=1) - 0.5).max() < 1e-12 and 7 <= len(pairs) <= 11
+    ends = pairs[at[:, 0] < -1 + 1e-12]
+    assert len(ends) == 2 and np.isin(ends, cloud.groups["boundary"]).all()
+    assert np.abs(cloud.normals[ends] - [-1.0, 0.0]).max() < 1e-6
+    side = cloud.points[cloud.regions["out"]]
+    assert (np.abs(side[side[:, 0] < -1 + 1e-12, 1]) > 0.5 - 1e-9).all()
+
+
 def test_layers_of_a_wall_share_their_ends():
     cloud = js.regions({"a": (0.0, 0.5), "b": (0.5, 2.0)}, spacing=lambda x: np.where(x[:, 0] < 0.5, 0.1, 0.3))
     assert cloud.points[cloud.interfaces["a|b"]].tolist() == [[[0.5], [0.5]]]
@@ -118,6 +135,9 @@ def test_the_side_of_a_point_is_that_of_the_true_shape():
         ({}, "expected a dict"),
         ({"a": (0.0, 0.5), "b": (0.6, 1.0)}, "touches no other region"),
         ({"a": (0.0, 0.5), "b": DISK}, "different dimensions"),
+        ({"a": corners(-1, -1, 0, 0), "b": corners(0, 0, 1, 1)}, "'a' and 'b' touch in a point alone"),
+        (dict(zip("ab", TANGENT)), "'b' and 'a' touch in a point alone"),
+        ({"out": js.sdf.difference(js.sdf.rectangle(*BOX), js.sdf.union(*TANGENT))}, r"shapes\['out'\]: .*touch in a"),
     ],
 )
 def test_shapes_that_do_not_fit_are_named_with_the_remedy(shapes, told):

@@ -13,7 +13,7 @@ from jsmitsm.cloud.cloud import INTERIOR
 from jsmitsm.cloud.filling import SpacingLike
 from jsmitsm.cloud.packing.octree import Spacing
 from jsmitsm.cloud.regions.lattice import cut_lattice
-from jsmitsm.cloud.regions.probes import directions, share_a_side
+from jsmitsm.cloud.regions.probes import directions, on_boundary, share_a_side
 from jsmitsm.cloud.regions.region_cloud import RegionCloud
 from jsmitsm.cloud.regions.shapes import Interval, Shape, shape_of
 from jsmitsm.cloud.shapes import Predicate, checked_bounds, checked_seed, grouped, own_normals
@@ -145,12 +145,12 @@ def _shared(shapes: dict[str, Shape], spacing: Spacing, seed: int) -> _Sketch:
     points, on, normals = np.zeros((0, dim)), {}, {}
     earlier: list[Shape] = []
     for name, shape in shapes.items():
-        taken = np.flatnonzero(np.abs(shape.distance(points)[0]) <= tolerance)
+        taken = np.flatnonzero(on_boundary(shape, points, _PROBE * spacing(points), tolerance))
         whole = not earlier or not len(taken)
         own = shape.boundary(spacing, seed, forced)
         new = np.ones(len(own.points), bool)
         for other in earlier:
-            new &= np.abs(other.distance(own.points)[0]) > tolerance
+            new &= ~on_boundary(other, own.points, _PROBE * spacing(own.points), tolerance)
         if not whole and shape.curved:
             new &= _apart(own.points, points[taken], spacing)
         made = np.arange(len(points), len(points) + int(new.sum()))
@@ -241,9 +241,14 @@ def _meet(sketch: _Sketch) -> None:
     count = member.sum(axis=0)
     lonely = np.flatnonzero((count == 1) & ~outer)
     if len(lonely):
+        name, at = names[int(member[:, lonely[0]].argmax())], points[lonely[:1]]
+        others = {n: shape.distance(at)[0][0] for n, shape in sketch.shapes.items() if n != name}
+        other = min(others, key=lambda n: others[n])
+        if others[other] > 0:
+            raise _touching(name, other, at[0])
         raise ValueError(
-            f"shapes: the boundary of {names[int(member[:, lonely[0]].argmax())]!r} at {points[lonely[0]]} lies inside "
-            "of another region: they overlap; subtract one from the other with js.sdf.difference"
+            f"shapes: the boundary of {name!r} at {at[0]} lies inside of {other!r}: they overlap; subtract one from the "
+            "other with js.sdf.difference"
         )
     if points.shape[1] == 3:
         ends = np.flatnonzero((count > 1) & outer)
@@ -252,8 +257,29 @@ def _meet(sketch: _Sketch) -> None:
             at = points[ends[0] if len(ends) else many[0]]
             raise ValueError(
                 f"shapes: in 3D an interface ends or meets others near {at}; interfaces must be closed surfaces there, "
-                "as an inclusion's"
+                "as an inclusion's. Cut a lattice by predicates, js.regions(..., lattice=...), or mesh the regions and "
+                "read js.files.from_mesh(mesh, regions=True)"
             )
+    _check_touching(sketch, member)
+
+
+def _check_touching(sketch: _Sketch, member: np.ndarray) -> None:
+    """Shapes that meet at a particle share a piece of boundary there, with one another or with a third."""
+    for k, name in enumerate(sketch.shapes):
+        bound = np.zeros(len(sketch.points), bool)
+        for pair, ids in sketch.interfaces.items():
+            bound[ids] |= name in pair
+        alone = np.flatnonzero(member[k] & (member.sum(axis=0) > 1) & ~bound)
+        if len(alone):
+            other = next(n for n, there in zip(sketch.shapes, member[:, alone[0]]) if there and n != name)
+            raise _touching(name, other, sketch.points[alone[0]])
+
+
+def _touching(name: str, other: str, at: np.ndarray) -> ValueError:
+    return ValueError(
+        f"shapes: {name!r} and {other!r} touch in a point alone at {at}, and no particles fit into the gap beside it; "
+        "let them share a piece of boundary, or move them apart by a spacing"
+    )
 
 
 def _check_overlap(sketch: _Sketch, name: str, points: np.ndarray, h: np.ndarray) -> None:

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from jsmitsm.cloud.regions.shapes import Shape
+
 # So many of them.
 _PROBES = 24
+# A probe is inside of a shape from this part of its distance on.
+_INSIDE = 1e-3
 
 
 def share_a_side(one: np.ndarray, two: np.ndarray, member: np.ndarray, at: np.ndarray, dim: int) -> np.ndarray:
@@ -20,15 +24,29 @@ def share_a_side(one: np.ndarray, two: np.ndarray, member: np.ndarray, at: np.nd
     return np.asarray(touch.any(axis=0))
 
 
-def directions(dim: int) -> np.ndarray:
+def on_boundary(shape: Shape, points: np.ndarray, reach: np.ndarray, tolerance: float) -> np.ndarray:
+    """Mask of the points (M, D) where a shape ends: zero there, and negative on some side at the distance ``reach``.
+
+    A difference, ``max(box, -disk)``, is zero too along the side of the box that the disk has taken away from it.
+    """
+    mask = np.asarray(np.abs(shape.distance(points)[0]) <= tolerance)
+    at = np.flatnonzero(mask)
+    steps = directions(points.shape[1], 4 * _PROBES)
+    around = points[at][:, None] + reach[at][:, None, None] * steps
+    least = shape.distance(around.reshape(-1, points.shape[1]))[0].reshape(len(at), len(steps)).min(axis=1, initial=0.0)
+    mask[at] = least < -_INSIDE * reach[at]
+    return mask
+
+
+def directions(dim: int, count: int = _PROBES) -> np.ndarray:
     """Unit vectors to all sides."""
     if dim == 1:
         return np.array([[-1.0], [1.0]])
     if dim == 2:
         # Off the axes, along which boundaries often run.
-        angle = 2.0 * np.pi * (np.arange(_PROBES) + 0.37) / _PROBES
+        angle = 2.0 * np.pi * (np.arange(count) + 0.37) / count
         return np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    k = np.arange(_PROBES) + 0.5
-    z, angle = 1.0 - 2.0 * k / _PROBES, np.pi * (1.0 + 5.0**0.5) * k
+    k = np.arange(count) + 0.5
+    z, angle = 1.0 - 2.0 * k / count, np.pi * (1.0 + 5.0**0.5) * k
     radius = np.sqrt(1.0 - z * z)
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any, Protocol
 
 import numpy as np
@@ -55,8 +56,8 @@ class Interval:
 class Level:
     """The part of a box where a signed distance is negative."""
 
-    def __init__(self, sdf: Any, lo: np.ndarray, hi: np.ndarray):
-        self.lo, self.hi, self.curved = lo, hi, len(lo) == 3
+    def __init__(self, name: str, sdf: Any, lo: np.ndarray, hi: np.ndarray):
+        self._name, self.lo, self.hi, self.curved = name, lo, hi, len(lo) == 3
         self._region = levelset.SdfRegion(sdf, lo, hi)
         self.distance = self._region.distance
 
@@ -64,17 +65,28 @@ class Level:
         dim = len(self.lo)
         if dim != 2:
             return np.zeros((0, dim))
-        return contour.corners(self._region, spacing)
+        with self._named():
+            return contour.corners(self._region, spacing)
 
     def boundary(self, spacing: Spacing, seed: int, forced: np.ndarray) -> levelset.Boundary:
+        with self._named():
+            return levelset.checked(self._region, self._made(spacing, seed, forced))
+
+    @contextmanager
+    def _named(self) -> Iterator[None]:
+        """Errors tell which shape they speak of."""
+        try:
+            yield
+        except ValueError as fault:
+            raise ValueError(f"{self._name}: {fault}") from fault
+
+    def _made(self, spacing: Spacing, seed: int, forced: np.ndarray) -> levelset.Boundary:
         dim = len(self.lo)
         if dim == 1:
-            made = contour.line(self._region, spacing)
-        elif dim == 2:
-            made = contour.contour(self._region, spacing, forced)
-        else:
-            made = surface.surface(self._region, spacing, seed)
-        return levelset.checked(self._region, made)
+            return contour.line(self._region, spacing)
+        if dim == 2:
+            return contour.contour(self._region, spacing, forced)
+        return surface.surface(self._region, spacing, seed)
 
 
 class Polygons:
@@ -105,7 +117,7 @@ def shape_of(name: str, given: Any, bounds: Any, spacing: Spacing) -> Shape:
     if callable(given):
         if bounds is None:
             raise ValueError(f"bounds: needed for the signed distance {where}; give a box (lo, hi) that contains it")
-        return Level(given, *bounds)
+        return Level(where, given, *bounds)
     if hasattr(given, "geom_type"):
         return Polygons(where, _shapely_loops(where, given), spacing)
     try:

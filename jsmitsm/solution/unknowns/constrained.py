@@ -97,7 +97,8 @@ def solve_constrained(
     unknowns, values, good, steps = _linearly(run, lines, answer, start)
     if start:
         linearly = _entered_linearly(run, answer, start, unknowns)
-        if concrete(linearly) is not None and not bool(concrete(linearly)):
+        known = concrete(linearly)
+        if _bends(run, start) if known is None else not bool(known):
             run.go(start)
             return _jointly(run, lines, start, recipe, again, u0)
         good = good & linearly
@@ -230,6 +231,19 @@ def _multiplies(run: Bordered, start: dict[str, Any]) -> bool:
         return [x for x in run.numbers_of(run.moved(unknowns)).of_matrix if concrete(x) is None]
 
     return any(used_inputs(jax.make_jaxpr(rows)(start).jaxpr))
+
+
+def _bends(run: Bordered, start: dict[str, Any]) -> bool:
+    """Whether an unknown enters source or conditions other than linearly, where no number tells: the slope knows it."""
+
+    def parts(unknowns: dict[str, Any]) -> tuple[Any, Any]:
+        nums = run.numbers_of(run.moved(unknowns))
+        return run.right_of(nums), nums.held
+
+    def slope(unknowns: dict[str, Any]) -> Any:
+        return jax.jvp(parts, (unknowns,), (dict.fromkeys(unknowns, jnp.ones(())),))[1]
+
+    return any(used_inputs(jax.make_jaxpr(slope)({n: jnp.asarray(v, float) for n, v in start.items()}).jaxpr))
 
 
 def _same(one: list[Any], two: list[Any]) -> bool:
