@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, Literal, TypeAlias, TypedDict, get_args
 
 import numpy as np
@@ -15,7 +16,7 @@ from jsmitsm.equation.regions.interface import INTERFACE
 from jsmitsm.equation.regions.per_region import PerRegion
 from jsmitsm.linear.linsolve import SOLVERS, Solver
 from jsmitsm.particle.kernels import Kernel
-from jsmitsm.runtime.errors import did_you_mean, is_whole, refuse_masked, short
+from jsmitsm.runtime.errors import did_you_mean, is_number, is_whole, refuse_masked, short
 from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.taylor.multi_indices import HIGHEST
 
@@ -100,7 +101,10 @@ def check(
         raise ValueError("stencils: those of a cloud do not reach periodic images; leave stencils out")
     if not isinstance(throw, (bool, np.bool_)):
         raise ValueError(f"throw: expected True or False, got {short(throw)}")
-    _check_start(u0, (len(cloud), problem.fields))
+    if isinstance(u0, Mapping):
+        _check_starts(u0, cloud, problem.fields)
+    else:
+        _check_start(u0, (len(cloud), problem.fields))
     if not is_whole(order, 1, HIGHEST):
         raise ValueError(
             f"order: expected a whole number from 1 to {HIGHEST}, the degree of the expansions, got {short(order)}"
@@ -123,18 +127,28 @@ def _check_depth(depth: Any, method: str, order: Any) -> None:
         )
 
 
-def _check_start(u0: Any, shape: tuple[int, int]) -> None:
+def _check_starts(u0: Mapping[str, Any], cloud: Any, fields: int) -> None:
+    """A start for each region, a number too."""
+    regions = getattr(cloud, "regions", {})
+    if set(u0) != set(regions):
+        raise ValueError(f"u0: starts for the regions {list(u0)}; the cloud has {list(regions) or 'none'}")
+    for name, given in u0.items():
+        here = (len(regions[name]), fields)
+        _check_start(np.full(here, given) if is_number(given) else given, here, f"u0[{name!r}]")
+
+
+def _check_start(u0: Any, shape: tuple[int, int], name: str = "u0") -> None:
     """A start for Newton's method: nothing, a function, or finite values of the right shape."""
     if u0 is None or callable(u0) or is_traced(u0):
         return
-    refuse_masked(u0, "u0")
+    refuse_masked(u0, name)
     try:
         if np.iscomplexobj(u0):
             raise TypeError
         values = np.asarray(u0, float)
     except (TypeError, ValueError, OverflowError):
-        raise ValueError(f"u0: expected a function of x or an array, got {short(u0)}") from None
+        raise ValueError(f"{name}: expected a function of x or an array, got {short(u0)}") from None
     if values.shape not in (shape, shape[:1]):
-        raise ValueError(f"u0: expected a function, ({shape[0]},) or {shape}, got shape {values.shape}")
+        raise ValueError(f"{name}: expected a function, ({shape[0]},) or {shape}, got shape {values.shape}")
     if not np.isfinite(values).all():
-        raise ValueError("u0: NaN or infinite values; start from finite ones")
+        raise ValueError(f"{name}: NaN or infinite values; start from finite ones")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from typing import Any, Literal
 
 from jsmitsm.cloud.cloud import Cloud
@@ -54,7 +55,7 @@ def solve(
     basis_terms: int | None = None,
     formulation: Formulation = "auto",
     solver: Solver = "auto",
-    u0: ValueOrFunction | None = None,
+    u0: ValueOrFunction | Mapping[str, ValueOrFunction] | None = None,
     throw: bool = True,
 ) -> Solution:
     """Solve ``problem`` on ``cloud``.
@@ -92,7 +93,8 @@ def solve(
         "auto", "dense" (pure JAX), "sparse" (direct), "mixed" (direct, its factors in float32 and the rest in
         float64: two thirds of the time and memory) or "iterative".
     u0 : array_like or function, optional
-        Start of Newton's method for a nonlinear problem: (N,), (N, F) or a function of x.
+        Start of Newton's method for a nonlinear problem: (N,), (N, F) or a function of x; with several regions also a
+        dict of them, or of numbers, by region.
     throw : bool
         Raise ``js.SolveError`` where the solve fails; otherwise, and always under jit, ``converged`` is
         False.

@@ -58,6 +58,10 @@ def test_a_composite_wall_conducts_as_its_resistances_add_up():
     top = 20 + q * (0.1 / 1 + 0.2 / 50 + 0.05 / 5)
     assert abs(sol.u[cloud.groups["left"]] - top) < 1e-10 * top
     assert sol.flags == []
+    whole = sol.flux("left", k) + sol.flux("right", k)
+    with pytest.raises(ValueError, match=r"conductivity: given for \['a'\], and 'right' bounds 'c' too"):
+        sol.flux("right", {"a": 1.0})
+    assert abs(whole) < 1e-8
     assert abs(sol.flux("a|b", 50.0, region="b") + q) < 1e-8 and abs(sol.flux("a|b", 1.0, region="a") + q) < 1e-8
     # Every layer's values are linear, so is what lies between.
     assert np.abs(sol([[0.05], [0.2], [0.1]]) - np.array([84.0, 32.0, 34.0])).max() < 1e-9
@@ -124,8 +128,11 @@ def test_newton_conductivities_and_contacts_that_depend_on_u():
     nonlinear = lambda u, x: js.divergence(lambda y: ka(u(y)) * js.grad(u)(y))(x)  # noqa: E731
     root = float(np.real(min(np.roots([1 / 3, 0, 1, -q * 0.5]), key=lambda z: abs(np.imag(z)))))
     bcs = {"boundary": js.dirichlet(lambda x: x[0] * (root + drop + q * 0.25)), "a|b": js.interface(residual=residual)}
-    sol = js.solve(js.Problem({"a": nonlinear, "b": laplace}, bcs), cloud, order=6)
+    problem = js.Problem({"a": nonlinear, "b": laplace}, bcs)
+    sol = js.solve(problem, cloud, order=6)
     assert sol.converged and sol.iterations < 9
+    near = js.solve(problem, cloud, order=6, u0={"a": lambda x: q * x[0], "b": root + drop})
+    assert near.iterations < sol.iterations and np.abs(near.u - sol.u).max() < 1e-9
     # u + u^3 / 3 = q x in a; what order 6 on 11 particles leaves.
     x, u = cloud.points[cloud.regions["a"], 0], sol.region("a").u
     assert np.abs(u + u**3 / 3 - q * x).max() < 2e-6
@@ -286,6 +293,7 @@ def test_conditions_are_never_guessed():
     refused(r"takes 2, two for each field", bcs={**ends, "a|b": js.interface(residual=lambda a, b, x, n: a(x) - b(x))})
     turned = {"a": flux["a"], "b": lambda u, x, n: -2.0 * n @ js.grad(u)(x)}
     refused(r"opposite signs.*same n, which points from 'a' to 'b'", bcs={**ends, "a|b": js.interface(turned)})
+    refused(r"u0: starts for the regions \['a'\]; the cloud has \['a', 'b'\]", u0={"a": 1.0})
     refused(r"method: III is not made for clouds of several regions", method="III")
     free = {"boundary": js.free(), "a|b": good}
     orders = {4: lambda u, x: js.partial(u, (4,))(x), 1: lambda u, x: js.grad(u)(x)[0], 0: lambda u, x: u(x) - 1.0}

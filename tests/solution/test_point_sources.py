@@ -121,6 +121,19 @@ def test_one_dimension_and_two_sources_beside_a_smooth_one():
     assert abs(sol.u - (x**2 + hat(x))).max() < 1e-12
 
 
+@pytest.mark.parametrize("place", [0.47, 0.53])
+def test_a_source_within_a_spacing_of_an_interface(place):
+    """k u'' = delta on two layers held at zero, beside the place where they meet: piecewise linear."""
+    k, cloud = {"a": 1.0, "b": 3.0}, js.regions({"a": (0.0, 0.5), "b": (0.5, 1.0)}, spacing=0.1)
+    pde = {n: lambda u, x, c=c: c * js.laplacian(u)(x) for n, c in k.items()}
+    flux = {n: lambda u, x, normal, c=c: c * normal @ js.grad(u)(x) for n, c in k.items()}
+    bcs = {"boundary": js.dirichlet(0.0), "a|b": js.interface(flux)}
+    sol = js.solve(js.Problem(pde, bcs, sources=[js.point_source([place], 1.0)]), cloud)
+    left = place if place < 0.5 else 0.5 + (place - 0.5) / 3.0  # resistances to both ends
+    whole = 0.5 + 0.5 / 3.0
+    assert abs(sol([[place]])[0] + left * (whole - left) / whole) < 1e-12 and sol.flags == []
+
+
 def test_what_is_refused():
     ends = {"boundary": js.dirichlet(0.0)}
     there = [js.point_source(Y)]

@@ -13,7 +13,7 @@ from jsmitsm.cloud.cloud import INTERIOR
 from jsmitsm.cloud.filling import SpacingLike
 from jsmitsm.cloud.packing.octree import Spacing
 from jsmitsm.cloud.regions.lattice import cut_lattice
-from jsmitsm.cloud.regions.probes import directions, on_boundary, share_a_side
+from jsmitsm.cloud.regions.probes import directions, on_boundary, outward, share_a_side
 from jsmitsm.cloud.regions.region_cloud import RegionCloud
 from jsmitsm.cloud.regions.shapes import Interval, Shape, shape_of
 from jsmitsm.cloud.shapes import Predicate, checked_bounds, checked_seed, grouped, own_normals
@@ -144,17 +144,18 @@ def _shared(shapes: dict[str, Shape], spacing: Spacing, seed: int) -> _Sketch:
     dim = forced.shape[1]
     points, on, normals = np.zeros((0, dim)), {}, {}
     earlier: list[Shape] = []
+    probing = lambda x: _PROBE * spacing(x)  # noqa: E731
     for name, shape in shapes.items():
-        taken = np.flatnonzero(on_boundary(shape, points, _PROBE * spacing(points), tolerance))
+        taken = np.flatnonzero(on_boundary(shape, points, probing, tolerance))
         whole = not earlier or not len(taken)
         own = shape.boundary(spacing, seed, forced)
         new = np.ones(len(own.points), bool)
         for other in earlier:
-            new &= ~on_boundary(other, own.points, _PROBE * spacing(own.points), tolerance)
+            new &= ~on_boundary(other, own.points, probing, tolerance)
         if not whole and shape.curved:
             new &= _apart(own.points, points[taken], spacing)
         made = np.arange(len(points), len(points) + int(new.sum()))
-        direction = _outward(shape, points[taken], spacing)
+        direction = outward(shape, points[taken], spacing)
         _check_corners(shape, name, own, new, points[taken], tolerance)
         points = np.concatenate([points, own.points[new]])
         on[name] = np.concatenate([taken, made])
@@ -197,26 +198,6 @@ def _check_corners(
         )
 
 
-def _outward(shape: Shape, points: np.ndarray, spacing: Spacing) -> np.ndarray:
-    """Unit outward normals of a shape at points of its boundary; at corners the bisector of what is around."""
-    if not len(points):
-        return points
-    normal = shape.distance(points)[1]
-    if points.shape[1] != 2:
-        return normal
-    # A ring of probes just outside: the gradient at a corner itself may be that of either side, or nothing.
-    h = spacing(points)
-    total, angles = np.zeros(points.shape), np.arange(16) * np.pi / 8
-    for angle in angles:
-        step = 1e-4 * h[:, None] * np.array([np.cos(angle), np.sin(angle)])
-        distance, slope = shape.distance(points + step)
-        total += np.where((distance >= 0)[:, None], slope, 0.0)
-    length = np.linalg.norm(total, axis=1, keepdims=True)
-    mean = np.where(length > 1e-6, total / np.maximum(length, 1e-300), normal)
-    corner = (mean * normal).sum(axis=1) < np.cos(np.radians(5.0))
-    return np.where(np.asarray(corner | ~normal.any(axis=1))[:, None], mean, normal)
-
-
 def _meet(sketch: _Sketch) -> None:
     """Which shapes meet at every particle, and whether there is nothing on some side of it."""
     points, h = sketch.points, sketch.spacing(sketch.points)
@@ -247,8 +228,8 @@ def _meet(sketch: _Sketch) -> None:
         if others[other] > 0:
             raise _touching(name, other, at[0])
         raise ValueError(
-            f"shapes: the boundary of {name!r} at {at[0]} lies inside of {other!r}: they overlap; subtract one from the "
-            "other with js.sdf.difference"
+            f"shapes: the boundary of {name!r} at {at[0]} lies inside of {other!r}: they overlap; subtract one from "
+            "the other with js.sdf.difference"
         )
     if points.shape[1] == 3:
         ends = np.flatnonzero((count > 1) & outer)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from jsmitsm.cloud.packing.octree import Spacing
 from jsmitsm.cloud.regions.shapes import Shape
 
 # So many of them.
@@ -24,18 +25,40 @@ def share_a_side(one: np.ndarray, two: np.ndarray, member: np.ndarray, at: np.nd
     return np.asarray(touch.any(axis=0))
 
 
-def on_boundary(shape: Shape, points: np.ndarray, reach: np.ndarray, tolerance: float) -> np.ndarray:
-    """Mask of the points (M, D) where a shape ends: zero there, and negative on some side at the distance ``reach``.
+def on_boundary(shape: Shape, points: np.ndarray, reach: Spacing, tolerance: float) -> np.ndarray:
+    """Mask of the points (M, D) where a shape ends: zero there, and negative on some side at the distance ``reach``, a
+    function of the place.
 
     A difference, ``max(box, -disk)``, is zero too along the side of the box that the disk has taken away from it.
     """
     mask = np.asarray(np.abs(shape.distance(points)[0]) <= tolerance)
     at = np.flatnonzero(mask)
-    steps = directions(points.shape[1], 4 * _PROBES)
-    around = points[at][:, None] + reach[at][:, None, None] * steps
-    least = shape.distance(around.reshape(-1, points.shape[1]))[0].reshape(len(at), len(steps)).min(axis=1, initial=0.0)
-    mask[at] = least < -_INSIDE * reach[at]
+    if len(at):
+        steps, away = directions(points.shape[1], 4 * _PROBES), reach(points[at])
+        around = points[at][:, None] + away[:, None, None] * steps
+        depth = shape.distance(around.reshape(-1, points.shape[1]))[0].reshape(len(at), len(steps))
+        mask[at] = depth.min(axis=1) < -_INSIDE * away
     return mask
+
+
+def outward(shape: Shape, points: np.ndarray, spacing: Spacing) -> np.ndarray:
+    """Unit outward normals of a shape at points of its boundary; at corners the bisector of what is around."""
+    if not len(points):
+        return points
+    normal = shape.distance(points)[1]
+    if points.shape[1] != 2:
+        return normal
+    # A ring of probes just outside: the gradient at a corner itself may be that of either side, or nothing.
+    h = spacing(points)
+    total, angles = np.zeros(points.shape), np.arange(16) * np.pi / 8
+    for angle in angles:
+        step = 1e-4 * h[:, None] * np.array([np.cos(angle), np.sin(angle)])
+        distance, slope = shape.distance(points + step)
+        total += np.where((distance >= 0)[:, None], slope, 0.0)
+    length = np.linalg.norm(total, axis=1, keepdims=True)
+    mean = np.where(length > 1e-6, total / np.maximum(length, 1e-300), normal)
+    corner = (mean * normal).sum(axis=1) < np.cos(np.radians(5.0))
+    return np.where(np.asarray(corner | ~normal.any(axis=1))[:, None], mean, normal)
 
 
 def directions(dim: int, count: int = _PROBES) -> np.ndarray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax.numpy as jnp
@@ -72,7 +72,9 @@ def at(plain: Problem, unknowns: Any, carried: Any = None) -> Problem:
 
 
 def begun(problem: Problem, u0: Any) -> Any:
-    """A user's start, a function of (x[, params]) or an array, as one of the plain problem's."""
+    """A user's start, a function of (x[, params]), an array or a dict of these, as one of the plain problem's."""
+    if isinstance(u0, Mapping):
+        return {name: begun(problem, one) for name, one in u0.items()}
     extras = problem.extras
     if not callable(u0) or extras is None or not (extras.unknowns or extras.kernels):
         return u0

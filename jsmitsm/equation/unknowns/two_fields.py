@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
@@ -49,9 +49,12 @@ def two_fields(problem: Problem) -> Problem:
 
 
 def two_parts(start: Any, fields: int) -> Any:
-    """A start for Newton's method, (N,), (N, F) or a function, as one of the two parts."""
+    """A start for Newton's method, (N,), (N, F), a function or a dict of these, as one of the two parts."""
     if start is None:
         return None
+    if isinstance(start, Mapping):
+        whole = {n: v if callable(v) or jnp.ndim(v) else lambda x, v=v: v for n, v in start.items()}
+        return {n: two_parts(v, fields) for n, v in whole.items()}
     if callable(start):
         return lambda x: jnp.concatenate([jnp.ravel(p) for p in parts(start, x)])
     start = jnp.reshape(jnp.asarray(start), (-1, fields))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import jax
@@ -28,16 +29,28 @@ def start(disc: Discretization, problem: Problem, u0: Any) -> tuple[Any, Any]:
     n, fields = disc.held.shape
     if u0 is None:
         values = np.zeros((n, fields))
-    elif callable(u0):
-        points = jax.lax.stop_gradient(disc.cloud.points)
-        values = sample(u0, points, problem.params, fields, "u0").T
+    elif isinstance(u0, Mapping):
+        points, ids = disc.cloud.points, disc.cloud.regions  # type: ignore[attr-defined]
+        parts = [_values(u0[name], points[ids[name]], problem, f"u0[{name!r}]") for name in ids]
+        xp: Any = jnp if is_traced(parts) else np
+        values = xp.concatenate(parts)[np.argsort(np.concatenate(list(ids.values())))]
     else:
-        values = (u0 if is_traced(u0) else np.asarray(u0, float)).reshape(n, fields)
+        values = _values(u0, disc.cloud.points, problem, "u0")
     values = jax.lax.stop_gradient(values)
     if concrete(values) is None or is_traced(disc.stencils.indices):
         return values, jnp.zeros((n, fields, disc.rec.size)).at[:, :, 0].set(values)
     given = np.asarray(concrete(values))
     return given, fitted(disc, given)
+
+
+def _values(given: Any, points: Any, problem: Problem, where: str) -> Any:
+    """A function, an array or a number as values (n, F)."""
+    shape = len(points), problem.fields
+    if callable(given):
+        return sample(given, jax.lax.stop_gradient(points), problem.params, problem.fields, where).T
+    if np.ndim(given) == 0:
+        return np.full(shape, float(given))
+    return (given if is_traced(given) else np.asarray(given, float)).reshape(shape)
 
 
 def harmonic(disc: Discretization) -> tuple[np.ndarray, np.ndarray] | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
@@ -276,7 +276,10 @@ class RegionsSolution(Solution):
             total = total + self._one(name).integral(group)
         return total
 
-    def flux(self, group: str, conductivity: ValueOrFunction = 1.0, *, region: str | None = None) -> jax.Array:
+    def flux(
+        self, group: str, conductivity: ValueOrFunction | Mapping[str, ValueOrFunction] = 1.0, *,
+        region: str | None = None,
+    ) -> jax.Array:  # fmt: skip
         """The integral of conductivity n . grad u over a boundary group or one side of an interface.
 
         ``n`` points outward, on an interface ``"a|b"`` from a to b for both sides.
@@ -285,8 +288,8 @@ class RegionsSolution(Solution):
         ----------
         group : str
             A boundary group or an interface ``"a|b"``.
-        conductivity : float or function
-            A number, or a function of one point x (D,).
+        conductivity : float, function or mapping
+            A number, or a function of one point x (D,); by the names of the regions where each has its own.
         region : str, optional
             The region; for an interface the side, which must be named.
 
@@ -317,7 +320,12 @@ class RegionsSolution(Solution):
         total: Any = 0.0
         for name in self._those(group, region):
             turned = group in self.cloud.interfaces and sides(group)[1] == name
-            total = total + self._one(name).flux(group, conductivity) * (-1.0 if turned else 1.0)
+            own: Any = conductivity
+            if isinstance(conductivity, Mapping):
+                if name not in conductivity:
+                    raise ValueError(f"conductivity: given for {list(conductivity)}, and {group!r} bounds {name!r} too")
+                own = conductivity[name]
+            total = total + self._one(name).flux(group, own) * (-1.0 if turned else 1.0)
         return total
 
     def _those(self, group: str | None, region: str | None) -> list[str]:

@@ -162,9 +162,11 @@ def check_inside(sources: Any, cloud: Cloud) -> None:
     places = [concrete(source.place) for source in sources]
     if any(place is None or np.shape(place) != (cloud.dim,) for place in places) or concrete(cloud.points) is None:
         return  # refused by name elsewhere, or not known
-    inside = in_domain(cloud, np.array(places, float), "nan")
-    if inside is not None and not np.all(inside):
-        at = places[np.flatnonzero(~np.asarray(inside))[0]]
+    parts = [cloud.region(name) for name in cloud.regions] if isinstance(cloud, RegionCloud) else [cloud]
+    found = [in_domain(part, np.array(places, float), "nan") for part in parts]
+    inside = np.any([np.ones(len(places), bool) if one is None else np.asarray(one) for one in found], axis=0)
+    if not inside.all():
+        at = places[np.flatnonzero(~inside)[0]]
         raise ValueError(f"sources: x0 = {np.asarray(at)} is outside of the domain; a point source lies inside of it")
 
 
