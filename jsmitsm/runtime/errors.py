@@ -33,6 +33,7 @@ SYMPTOMS = {
     "Between the particles boundary data": "data",
     "The equation is not the same": "seam",
     "changes its sign": "turned",
+    "do not settle in Newton's method": "unsettled",
     "The estimated error is": "estimate",
     "No order reaches the tolerance": "tolerance",
     "The data may not balance": "balance",

@@ -370,7 +370,18 @@ def _far_away(run: Any, values: np.ndarray, nums: Any, out: list[str], found: di
         )
 
 
-DOUBTS = (_condition, _misfit, _waves, _roughness, _source, _coefficients, _weakness, _peclet, _turned)
+def unsettled(run: Any, values: np.ndarray, nums: Any, out: list[str], found: dict[str, float]) -> None:
+    """Several polynomials may fit a particle equally well, and its values be right: the estimate knows."""
+    at = run.unsettled
+    found["unsettled"] = len(at)
+    if len(at):
+        out.append(
+            f"The expansions of {len(at)} particle(s), first {some(at)}, do not settle in Newton's method: the solution "
+            "is sharper there than the cloud resolves; refine it."
+        )
+
+
+DOUBTS = (_condition, _misfit, _waves, _roughness, _source, _coefficients, _weakness, _peclet, _turned, unsettled)
 # The tests that ask the whole system, and those that ask one region of several alone.
 OF_THE_WHOLE = (_round_off, _condition, _far_away)
 OF_A_REGION = (_jumps, _contradictions, _misfit, _waves, _roughness, _coefficients, _peclet, _turned)

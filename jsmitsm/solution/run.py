@@ -51,6 +51,7 @@ class Run:
         self.seconds: dict[str, float] = {"local": 0.0, "assembly": 0.0, "solve": 0.0}
         self.messages: list[str] = []
         self.against: list[str] = []  # those of the messages that speak against the solution
+        self.unsettled = np.zeros(0, int)  # particles whose expansions Newton's method kept from moving
         self.failed = False
         self.linear: dict[str, Any] = {}
         self.changes: list[float] = []  # of Newton's steps, relative to the solution
@@ -144,7 +145,7 @@ class Run:
 
     def _forget(self) -> None:
         """What an earlier step said speaks of other rows."""
-        self.messages, self.against, self.failed = [], [], False
+        self.messages, self.against, self.failed, self.unsettled = [], [], False, np.zeros(0, int)
         self.__dict__.pop("factor", None)
         self.__dict__.pop("misfit", None)
 

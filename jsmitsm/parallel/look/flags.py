@@ -39,6 +39,7 @@ class Look:
     """A finished solve as the flags look at it: rows of the own particles, numbers and values of those around too."""
 
     formulation, misfit, bordering = "loo", None, 0
+    unsettled = ()  # here nobody is kept from moving
 
     def __init__(self, local: Local, system: System, taylor: Any):
         self.local, self.disc, self.problem = local, local.disc, local.disc.problem

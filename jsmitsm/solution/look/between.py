@@ -62,8 +62,8 @@ def beyond_kinks(run: Any, values: Any) -> np.ndarray | None:
 
 
 def has_kinks(disc: Discretization) -> bool:
-    """Whether series of a linear problem may end within a support."""
-    return disc.linear and disc.traced.kinked and disc.rec.degree >= 2
+    """Whether series of the equation, of a nonlinear one about the solution, may end within a support."""
+    return disc.traced.kinked and disc.rec.degree >= 2
 
 
 def out_of_series(disc: Discretization, nums: Numbers, problem: Problem, fitted: np.ndarray) -> Numbers:

@@ -25,7 +25,7 @@ from jsmitsm.runtime.progress import bar
 from jsmitsm.runtime.tracers import concrete, is_traced
 from jsmitsm.solution.nonlinear.damped import DONE, GOOD, MOST, Found, damped
 from jsmitsm.solution.nonlinear.start import harmonic, start
-from jsmitsm.solution.nonlinear.steps import Iterate, Record, advance, raising, relaxed
+from jsmitsm.solution.nonlinear.steps import Falling, Iterate, Record, advance, raising, relaxed
 from jsmitsm.solution.run import Run
 
 # Under jit, where no condition is known, steps below STALLED that do not fall are taken to be round-off.
@@ -155,15 +155,11 @@ def from_nearer(record: Record, best: Found, near: Iterate | None) -> Found:
 
 
 def judged(run: Run, found: Found) -> Found:
-    """Data of a field that floats must balance at a solution; particles that do not settle are told."""
+    """Data of a field that floats must balance at a solution; particles that do not settle are left to the flags."""
     if found.good and run.floating:
         run.check_balance(found.at.taylor)
         found = found._replace(good=not run.failed)
-    if len(found.frozen):
-        run.object(
-            f"The expansions of {len(found.frozen)} particle(s), first {some(found.frozen)}, do not settle: the "
-            "solution is sharper there than the cloud resolves; refine it."
-        )
+    run.unsettled = found.frozen
     return found
 
 
@@ -210,7 +206,7 @@ def _in_pseudo_time(record: Record, begin: Iterate, first: Iterate) -> Iterate |
 
 def wandering(record: Record, begin: Iterate, first: Iterate) -> Iterate | None:
     """Full steps, whatever their length: near singular matrices they are long and lead far, and come back."""
-    here, target = begin, first
+    here, target, falling = begin, first, Falling()
     for _ in range(WANDERING):
         after = record.tried(target)
         if after is None:
@@ -220,6 +216,8 @@ def wandering(record: Record, begin: Iterate, first: Iterate) -> Iterate | None:
         record.went(length, target.size)
         if length <= NEAR * target.size:
             return target
+        if not falling.still(length / target.size):
+            return None
     return None
 
 

@@ -34,6 +34,8 @@ from jsmitsm.taylor.multi_indices import multi_indices
 FIRST, SMALL, GROWTH = 0.5, 0.1, 2.0
 # From steps this short Newton's method goes on; so many solves at most, and so many times a step is cut in a row.
 NEAR, LONGEST, CUTS = 1e-3, 60, 4
+# A search of which so many steps in a row come no nearer than this part of the least so far leads nowhere.
+PATIENCE, NEARER = 10, 0.9
 
 # Round-off times this and the condition of the matrix may keep the steps from falling, up to a part ROUND_OFF of the
 # solution.
@@ -80,6 +82,19 @@ def shortest(
     shares = np.linalg.lstsq(columns[:, :-1], columns[:, -1], rcond=1e-10)[0]
     shares = np.append(shares, 1.0 - shares.sum())
     return Iterate(*(sum(a * x for a, x in zip(shares, each)) for each in zip(*(new for _, new in history))))
+
+
+class Falling:
+    """Whether what a search makes small still falls."""
+
+    def __init__(self) -> None:
+        self.least, self.waited = np.inf, 0
+
+    def still(self, left: float) -> bool:
+        """Told after each step; False after ``PATIENCE`` of them that came no nearer."""
+        nearer = left < NEARER * self.least
+        self.least, self.waited = (left, 0) if nearer else (self.least, self.waited + 1)
+        return self.waited < PATIENCE
 
 
 class Frozen:
@@ -241,7 +256,7 @@ def relaxed(record: Record, here: Iterate, scales: np.ndarray) -> Iterate | None
     """
     disc = record.run.disc
     held = disc.held.reshape(-1)
-    pull = Pull(np.flatnonzero(~held), disc.rec.fields, scales)
+    pull, falling = Pull(np.flatnonzero(~held), disc.rec.fields, scales), Falling()
     cuts = 0
     for _ in range(LONGEST):
         pull.here = here.values
@@ -256,5 +271,7 @@ def relaxed(record: Record, here: Iterate, scales: np.ndarray) -> Iterate | None
         here, cuts = new, 0
         if moved < NEAR and pull.strength < NEAR:
             return here
+        if not falling.still(pull.residual):
+            return None
         pull.strength *= 1.0 / GROWTH if moved < SMALL else GROWTH if moved > FIRST else 1.0
     return None

@@ -185,6 +185,7 @@ class RegionsRun(Run):
         for test in flags.OF_THE_WHOLE:
             test(self, values, self.nums, certain, found)
         doubts: list[str] = []
+        flags.unsettled(self, values, self.nums, doubts, found)
         told: list[str]
         for part, own, rows in zip(self.disc.parts, self.nums.parts, self.parts):
             told, found = [], {}
