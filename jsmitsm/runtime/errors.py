@@ -34,6 +34,7 @@ SYMPTOMS = {
     "The equation is not the same": "seam",
     "changes its sign": "turned",
     "do not settle in Newton's method": "unsettled",
+    "do not reach their nearest neighbours": "unmet",
     "The estimated error is": "estimate",
     "No order reaches the tolerance": "tolerance",
     "The data may not balance": "balance",

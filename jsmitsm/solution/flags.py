@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -24,7 +25,7 @@ from jsmitsm.discretization.resolution.contradictions import contradictions
 from jsmitsm.discretization.resolution.steepness import steepness, unseen
 from jsmitsm.discretization.rows import all_rows
 from jsmitsm.runtime.errors import some
-from jsmitsm.solution.look.between import between, beyond_kinks, even, seam, unseen_data
+from jsmitsm.solution.look.between import between, beyond_kinks, even, out_of_reach, seam, unseen_data
 from jsmitsm.solution.look.sizes import predicted, scales, share
 
 # A particle may differ from the linear function through its neighbours by this part of the
@@ -62,6 +63,8 @@ CLEARED = 0.02
 MISSED, AGREED = 1.0, 0.3
 # ... or boundary data so much: seven particles a wavelength leave an eighth of the data.
 DATA = 0.3
+# ... or values that no polynomial reaches: above 0.27 where estimates were blind, below 0.05 of solutions right to 1 %.
+REACHED = 0.2
 # Where the highest derivatives change their sign, a smooth solution has a smaller estimated error than this.
 TURNED = 1e-3
 # Measures below these clear a solution without an estimate, but for kinks. Of 250 random linear problems they cleared
@@ -109,17 +112,27 @@ def flags(run: Any, values: Any, nums: Any, estimated: Callable[[], float]) -> t
         if found["estimate"] > (TURNED if found.get("turned") else CLEARED):
             return doubts, found
     # Near a resonance any residual grows without bound, that of the truncation too; the estimate has its signs.
-    return [] if singular else _unseen(run, values, found, cleared and even(run)), found
+    return [] if singular else _unseen(run, values, found, cleared), found
 
 
-def _unseen(run: Any, values: np.ndarray, found: dict[str, float], nothing: bool) -> list[str]:
-    """What no particle sees, and with them no estimate: between them (``nothing`` there), and beyond a seam."""
-    every = whole(run.disc)
+def _unseen(run: Any, values: np.ndarray, found: dict[str, float], cleared: bool) -> list[str]:
+    """What no particle sees, and with them no estimate: between them, and beyond a seam; cleared: by cheap tests."""
+    every, fitted = whole(run.disc), cache(lambda: run.fitted(run.nums, values))
     part = lambda missed: share(every.own(missed), every.own(values), told=every)
-    found["missed"] = missed = 0.0 if nothing else part(between(run, values))
+    found["missed"] = missed = 0.0 if cleared and even(run) else part(between(run, fitted))
     found["data"] = data = part(unseen_data(run))
     found["seam"] = beyond = part(seam(run, values))
     told = []
+    # Even coefficients degenerate nowhere: what a solution changes by, the cheap tests see.
+    if not (cleared and run.disc.traced.constant):
+        unmet, at = out_of_reach(run, values, fitted)
+        found["unmet"], at = part(unmet), every.named(at)
+        if found["unmet"] > REACHED:
+            told.append(
+                f"The local polynomials of {len(at)} particle(s), first {some(at)}, do not reach their nearest "
+                f"neighbours, which makes {found['unmet']:.0%} of the solution, and no order sees it: beside a "
+                "singular point, or in a layer thinner than the spacing; refine there."
+            )
     if missed > (AGREED if found.get("source", 0.0) > SOURCE else MISSED):
         told.append(
             f"Between the particles the equation is missed by as much as makes {missed:.0%} of the solution: the "
@@ -372,12 +385,11 @@ def _far_away(run: Any, values: np.ndarray, nums: Any, out: list[str], found: di
 
 def unsettled(run: Any, values: np.ndarray, nums: Any, out: list[str], found: dict[str, float]) -> None:
     """Several polynomials may fit a particle equally well, and its values be right: the estimate knows."""
-    at = run.unsettled
-    found["unsettled"] = len(at)
-    if len(at):
+    found["unsettled"] = count = len(run.unsettled)
+    if count:
         out.append(
-            f"The expansions of {len(at)} particle(s), first {some(at)}, do not settle in Newton's method: the solution "
-            "is sharper there than the cloud resolves; refine it."
+            f"The expansions of {count} particle(s), first {some(run.unsettled)}, do not settle in Newton's method: it "
+            "hangs on what the cloud does not resolve there; refine it."
         )
 
 

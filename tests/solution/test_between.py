@@ -134,6 +134,45 @@ def test_no_order_sees_beyond_a_jump_but_the_estimate_does(order, n):
         assert error > 0.01 and 0.3 < told / error < 5.0 and (sol.flags or told < 0.02)
 
 
+def test_nor_where_the_equation_is_not_linear():
+    """u'' - u^3 with a source that jumps, and with a thin layer of it: both were told to be right to 1e-7."""
+    for at, wide, strength, order in ((0.48, 1.0, 40.0, 4), (0.505, 0.06, 300.0, 4), (0.48, 1.0, 40.0, 6)):
+        inside = lambda x, a=at, w=wide: jnp.where((x > a) & (x < a + w), 1.0, 0.0)
+        bent = lambda x, a=at, w=wide, c=strength: c * (
+            jnp.maximum(x - a, 0.0) ** 2 / 2.0 - jnp.maximum(x - a - w, 0.0) ** 2 / 2.0
+        )
+        pde = lambda u, x, f=inside, v=bent, c=strength: js.laplacian(u)(x) - u(x) ** 3 - c * f(x[0]) + v(x[0]) ** 3
+        line = js.interval(0.0, 1.0, 15)
+        sol = js.solve(js.Problem(pde, {s: js.dirichlet(lambda x, v=bent: v(x[0])) for s in ENDS}), line, order=order)
+        right = np.asarray(bent(jnp.asarray(line.points[:, 0])))
+        error, told = (np.linalg.norm(e) / np.linalg.norm(right) for e in (sol.u - right, sol.error_estimate()))
+        assert error > 0.001 and 0.3 < told / error < 10.0 and (sol.flags or told < 0.02)
+
+
+@pytest.mark.parametrize("bend", [0.0, 0.1])
+def test_a_well_thinner_than_the_spacing(bend):
+    """r u'' + k u' = 0 around a thin well, u = log r or 1 - 1/r: all orders agree on a solution 10 to 90 % off."""
+    for k, exact, radius, n in ((1.0, jnp.log, 1e-5, 41), (1.0, jnp.log, 1e-3, 41), (1.0, jnp.log, 1e-2, 21),
+                                (2.0, lambda r: 1.0 - 1.0 / r, 1e-2, 41), (1.0, jnp.log, 0.1, 41)):  # fmt: skip
+        line = js.interval(radius, 1.0, n)
+        pde = lambda u, x, k=k, f=exact: (
+            x[0] * js.laplacian(u)(x) + k * js.grad(u)(x)[0] - bend * x[0] * (u(x) ** 3 - f(x[0]) ** 3)
+        )
+        ends = {"left": js.dirichlet(float(exact(jnp.asarray(radius)))), "right": js.dirichlet(0.0)}
+        sol = js.solve(js.Problem(pde, ends), line, u0=lambda x, f=exact: f(x[0]))
+        right = np.asarray(exact(jnp.asarray(line.points[:, 0])))
+        wrong = np.linalg.norm(sol.u - right) > 0.1 * np.linalg.norm(right)
+        told = any("do not reach their nearest neighbours" in flag for flag in sol.flags)
+        assert wrong == told == (radius < 0.1) and (wrong or not sol.flags)
+
+
+def test_values_that_have_no_part_in_the_solution():
+    """Of e^2 u'' = u^3 - u with a layer far thinner than the spacing the solution u = 0 is found, with two spikes."""
+    pde = lambda u, x: 4e-4 * js.laplacian(u)(x) - u(x) ** 3 + u(x)
+    ends = {"left": js.dirichlet(-1.0), "right": js.dirichlet(1.0)}
+    assert flagged(pde, ends, js.interval(-1.0, 1.0, 22), "do not reach their nearest neighbours")
+
+
 def test_branches_without_a_kink_leave_the_estimate_alone():
     """A trace is a choice by constants, and a division made safe never is by zero."""
     ends = dict.fromkeys(ENDS, js.dirichlet(0.0))

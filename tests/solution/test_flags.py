@@ -116,6 +116,17 @@ def test_squares_of_huge_values_do_not_overflow(form):
         assert sol.flags == []  # with the estimate
 
 
+def test_what_does_not_settle_is_a_doubt_that_the_estimate_clears():
+    """Newton's method may end with particles whose expansions it kept from moving."""
+    for frequency, flagged in ((2.0, False), (22.0, True)):
+        wave = lambda x, k=frequency: jnp.sin(k * x[0])
+        pde = lambda u, x, f=wave: js.laplacian(u)(x) - js.laplacian(f)(x) - u(x) ** 3 + f(x) ** 3
+        ends = {"left": js.dirichlet(wave), "right": js.dirichlet(wave)}
+        sol = js.solve(js.Problem(pde, ends), js.interval(0.0, 1.0, 11), order=2)
+        sol._report.unsettled = np.array([4])
+        assert any("1 particle(s), first [4], do not settle" in flag for flag in sol.flags) == flagged
+
+
 def test_flags_survive_pickling():
     eps = 0.01
     layer = lambda x: x[0] - jnp.expm1(x[0] / eps) / jnp.expm1(1 / eps)

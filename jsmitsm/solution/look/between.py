@@ -1,7 +1,8 @@
 """What the particles do not see of a problem, and what it would make of the solution.
 
-Between them the residual that the local polynomials leave, where nothing made it small, and boundary data; beyond a
-kink or a jump what the series of one side leave out, beyond a periodic seam the equation on its other side.
+Between them the residual that the local polynomials leave, where nothing made it small, boundary data, and values that
+no polynomial reaches; beyond a kink or a jump what the series of one side leave out, beyond a periodic seam the
+equation on its other side.
 """
 
 from __future__ import annotations
@@ -33,14 +34,19 @@ UNEVEN, SMALL = 0.2, 0.01
 # A series ends at a kink where it misses what is halfway to a neighbour by so many times its last two degrees there,
 # and by more than this part of what is there.
 ENDED, FAINT = 3.0, 1e-6
+# A polynomial does not reach its neighbours where it misses one by this part of the largest change to any of them.
+LOST = 0.2
 
 
-def between(run: Any, values: Any) -> np.ndarray:
-    """What the residual between the particles makes of the solution of a run, (N, F)."""
+def between(run: Any, fitted: Callable[[], np.ndarray]) -> np.ndarray:
+    """What the residual between the particles makes of the solution of a run, (N, F).
+
+    fitted: makes the local polynomials (N, F, K), here and below.
+    """
     disc = run.disc
     if same_everywhere(disc):
         return np.zeros(disc.held.shape)
-    return _made_of(run, unresolved(disc, run.nums, run.problem, run.fitted(run.nums, values)))
+    return _made_of(run, unresolved(disc, run.nums, run.problem, fitted()))
 
 
 def same_everywhere(disc: Discretization) -> bool:
@@ -59,6 +65,35 @@ def beyond_kinks(run: Any, values: Any) -> np.ndarray | None:
         return None
     left_out = out_of_series(disc, nums, run.problem, run.fitted(nums, values))
     return _made_of(run, left_out) if whole(disc).total(int(np.any(left_out.source))) else None
+
+
+def out_of_reach(run: Any, values: np.ndarray, fitted: Callable[[], np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """What values that neighbours' polynomials miss make of the solution (N, F), and whose polynomials these are.
+
+    Beside a singular point, as where a well is thinner than the spacing, and where held values have no part in the
+    solution, the series of all orders end alike, and no estimate sees it. Polynomials that reach their nearest
+    neighbours, however well, are taken for right: what they miss is the estimate's. Nothing in the least-squares form,
+    which has a misfit of its own.
+    """
+    disc, zero = run.disc, np.zeros(run.disc.held.shape)
+    if run.formulation == "lsq":
+        return zero, np.zeros(0, int)
+    points, u, missed = np.asarray(disc.points, float), fitted(), zero.copy()
+    powers = np.array(multi_indices(disc.rec.dim, disc.rec.reach))[: u.shape[2]]
+    for cls in disc.classes:
+        own, total, most, change = values[cls.ids], *(np.zeros((len(cls.ids), u.shape[1])) for _ in range(3))
+        near = np.asarray(cls.neighbours)[:, 1 : 1 + 2 * disc.rec.dim]
+        for other in np.where(near >= 0, near, cls.ids[:, None]).T:
+            there = values[np.asarray(disc.images.owners(other))]
+            terms = np.prod((points[other] - points[cls.ids])[:, None] ** powers, axis=2)
+            off = np.where((other != cls.ids)[:, None], np.abs(np.einsum("nfk,nk->nf", u[cls.ids], terms) - there), 0.0)
+            total, most, change = total + off, np.maximum(most, off), np.maximum(change, np.abs(there - own))
+        missed[cls.ids] = np.where(most > LOST * change, total / max(near.shape[1], 1), 0.0)
+    free, told = ~disc.held if disc.part is None else ~disc.held & disc.part.own[:, None], whole(disc)
+    most = told.most((missed * free).max(axis=0, initial=0.0))
+    if not np.any(most):
+        return zero, np.zeros(0, int)
+    return solved_alone(run, missed[free]), np.flatnonzero((free & (missed > LOST * most)).any(axis=1))
 
 
 def has_kinks(disc: Discretization) -> bool:
