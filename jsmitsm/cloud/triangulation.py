@@ -130,8 +130,9 @@ def normals_of(cloud: Cloud) -> np.ndarray:
     """The normals (N, D) of a cloud, those of its boundary particles fitted where it has none."""
     if cloud.normals is not None:
         return np.asarray(cloud.normals)
-    out = np.full(cloud.points.shape, np.nan)
-    out[cloud.boundary] = inside_of(cloud).normals
+    out, inside = np.full(cloud.points.shape, np.nan), inside_of(cloud)
+    if inside is not None:  # it is none of points that JAX traces, which have no simplices either
+        out[cloud.boundary] = inside.normals
     return out
 
 
