@@ -123,8 +123,8 @@ def _unseen(run: Any, values: np.ndarray, found: dict[str, float], cleared: bool
     found["data"] = data = part(unseen_data(run))
     found["seam"] = beyond = part(seam(run, values))
     told = []
-    # Even coefficients degenerate nowhere: what a solution changes by, the cheap tests see.
-    if not (cleared and run.disc.traced.constant):
+    # Constant coefficients degenerate nowhere, and layers that fall to nothing within the spacing may be right.
+    if not (run.disc.linear and run.disc.traced.constant):
         unmet, at = out_of_reach(run, values, fitted)
         found["unmet"], at = part(unmet), every.named(at)
         if found["unmet"] > REACHED:
