@@ -170,7 +170,7 @@ def test_what_was_tried_is_told():
     tried = "damped steps, steps without depth, pseudo-time steps, full steps were tried, .*stages"
     with pytest.raises(js.SolveError, match=tried) as told:
         js.solve(bratu, js.interval(0.0, 1.0, 21))
-    # A search ends where nothing falls any more: 233 before.
+    # A search ends where nothing falls any more.
     assert int(re.search(r"(\d+) linear solves", str(told.value))[1]) < 120
 
 
