@@ -132,6 +132,13 @@ CLOUDS = [
     ("box-lo-nan", lambda: js.box((0, 0, NAN), (1, 1, 1), (5, 5, 5)), "lo:", "finite"),
 ]
 
+CLOUDS += [
+    ("spacing-of-nothing", lambda: js.interval(0.0, 1.0, spacing=lambda: 0.1), "spacing:", r"points \(M, D\)"),
+    ("spacing-by-name", lambda: js.from_polygon([(0, 0), (1, 0), (0, 1)], lambda x: x.size * x.hight), "spacing:",
+     r"lengths \(M,\)"),
+    ("holes-number", lambda: js.from_polygon([(0, 0), (1, 0), (0, 1)], 0.3, holes=jnp.zeros(())), "holes:", "list"),
+]
+
 BAD_H = [("zero", 0.0), ("negative", -1.0), ("nan", NAN), ("inf", INF), ("text", "a"), ("None", None),
          ("complex", 1j), ("bool", True), ("ragged", [[1.0], [1.0, 2.0]])]  # fmt: skip
 KERNELS = [
@@ -192,6 +199,10 @@ PROBLEMS = [
     ("fields-fraction", lambda: js.Problem(poisson, ENDS, fields=1.5), "fields:", "number of unknown fields"),
     ("fields-bool", lambda: js.Problem(poisson, ENDS, fields=True), "fields:", "number of unknown fields"),
     ("fields-text", lambda: js.Problem(poisson, ENDS, fields="two"), "fields:", "number of unknown fields"),
+    ("fields-beyond-all", lambda: js.Problem(poisson, ENDS, fields=10**400), "fields:", "999"),
+    *((f"sources-{s}", lambda s=s: js.Problem(poisson, ENDS, sources=s), r"sources\b", "js.point_source")
+      for s in (None, 3.0, "ab")),
+    ("point-source-beyond-all", lambda: js.point_source((10**400,)), "x0:", "one point"),
     ("params-text", lambda: js.Problem(poisson, ENDS, params={"k": "big"}), r"params.*k", "number"),
     ("params-nan", lambda: js.Problem(poisson, ENDS, params={"k": NAN}), r"params.*k", "finite"),
     ("field-beyond", lambda: js.Problem(poisson, {"left": js.dirichlet(0.0, field=1)}), "field=1", "fields 0 to 0"),
@@ -402,6 +413,11 @@ EVALUATION = [
     ("derivative-negative", evaluate(lambda s: s.derivative([[0.5]], (-1,))), "multi_index", "non-negative"),
     ("multi_indices-dim", lambda: js.multi_indices(0, 2), "dim", "1|positive"),
     ("multi_indices-fraction", lambda: js.multi_indices(2, 1.5), "order|degree", "whole|integer"),
+    *((f"multi_indices-dim-{k}", lambda d=d: js.multi_indices(d, 2), "dim:", "whole|axes")
+      for k, d in enumerate(([1], NAN, 1e300, True, 10**400, np.ones(2)))),
+    *((f"multi_indices-degree-{k}", lambda d=d: js.multi_indices(2, d), "degree:", "whole|lower")
+      for k, d in enumerate(([1], NAN, 2.0, None, 10**400, np.ones(2)))),
+    ("versions-to-a-name", lambda: js.show_versions("report.txt"), "file:", "open"),
     ("grad-of-number", lambda: js.grad(3.0), "operator", "function of the point"),
     ("laplacian-of-batch", lambda: js.laplacian(lambda x: x[0])(np.zeros((3, 2))), "x must", r"\(D,\)"),
 ]

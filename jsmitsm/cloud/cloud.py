@@ -91,6 +91,7 @@ class Cloud:
     """
 
     cell_groups = Groups({})  # also of clouds pickled before there were any
+    _fixed: tuple[str, ...] = ("points", "groups", "normals", "cell_groups")
     _shape: Any = None  # what the particles fill, where their maker knows it: pictures end there
 
     @explaining
@@ -109,8 +110,9 @@ class Cloud:
 
     def __setattr__(self, name: str, value: Any) -> None:
         # What was solved on a cloud rests on it.
-        if name in ("points", "groups", "normals", "cell_groups") and name in self.__dict__:
-            raise AttributeError(f"{name}: a Cloud does not change; take cloud.replace({name}=...) or a new js.Cloud")
+        if name in self._fixed and name in self.__dict__:
+            way = f"cloud.replace({name}=...)" if name in ("points", "normals") else "make another one"
+            raise AttributeError(f"{name}: a {type(self).__name__} does not change; {way}")
         object.__setattr__(self, name, value)
 
     def __getstate__(self) -> dict[str, Any]:

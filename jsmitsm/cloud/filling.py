@@ -15,7 +15,7 @@ import numpy as np
 from jsmitsm.cloud.packing.lattice import lattice
 from jsmitsm.cloud.packing.octree import Region, Spacing, morton, refine
 from jsmitsm.cloud.packing.relaxation import DENSITY, settled
-from jsmitsm.runtime.errors import short
+from jsmitsm.runtime.errors import IN_FUNCTIONS, short
 
 SpacingLike = float | Callable[[np.ndarray], Any]
 
@@ -41,7 +41,13 @@ def spacing_function(spacing: Any) -> Spacing:
         return Constant(float(value))
 
     def checked(x: np.ndarray) -> np.ndarray:
-        given = spacing(x)
+        try:
+            given = spacing(x)
+        except IN_FUNCTIONS as error:
+            raise ValueError(
+                f"spacing: the function fails for points of shape {x.shape} ({type(error).__name__}: {error}); "
+                "expected one of points (M, D) that returns lengths (M,)"
+            ) from error
         try:
             h = np.asarray(given, dtype=np.float64)
         except (TypeError, ValueError, OverflowError):

@@ -15,14 +15,15 @@ from jsmitsm.cloud import filling, levelset
 from jsmitsm.cloud.lattices.path import followed
 from jsmitsm.cloud.packing import relaxation
 from jsmitsm.cloud.packing.octree import Spacing
+from jsmitsm.runtime.errors import listed
 
 _SHARP = np.deg2rad(20.0)  # a vertex that turns by more is a corner of the shape, not a sample of a curve
 
 
 def checked_holes(holes: Any) -> list[Any]:
-    if isinstance(holes, (str, Mapping)) or not hasattr(holes, "__iter__"):
+    if isinstance(holes, (str, Mapping)):
         raise ValueError(f"holes: expected a sequence of polygons (V, 2), got {holes!r}")
-    holes = list(holes)
+    holes = listed("holes", holes, "a sequence of polygons (V, 2)")
     if any(np.ndim(hole) == 1 for hole in holes):
         raise ValueError("holes: expected a sequence of polygons (V, 2), got one polygon; pass holes=[vertices]")
     return holes

@@ -51,7 +51,7 @@ def partial(u: Any, multi_index: MultiIndex | int) -> Any:
     """
     try:
         index = (multi_index,) if isinstance(multi_index, int) else tuple(int(k) for k in multi_index)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise ValueError(
             f"multi_index: expected D whole numbers such as (1, 0), got {multi_index!r} (docs: problems)"
         ) from None

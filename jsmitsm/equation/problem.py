@@ -85,8 +85,8 @@ class Problem:
             pde = per_region(pde)
         elif not callable(pde):
             raise ValueError(f"pde: expected a function pde(u, x) returning the residual, got {type(pde).__name__}")
-        if isinstance(fields, bool) or not isinstance(fields, (int, np.integer)) or fields < 1:
-            raise ValueError(f"fields: expected the number of unknown fields (1, 2, ...), got {short(fields)}")
+        if isinstance(fields, bool) or not isinstance(fields, (int, np.integer)) or not 1 <= fields < 1000:
+            raise ValueError(f"fields: expected the number of unknown fields (1, 2, ... 999), got {short(fields)}")
         if not isinstance(bcs, Mapping):
             raise ValueError(
                 f"bcs: expected a dict from group name to condition, got {type(bcs).__name__}; "

@@ -35,7 +35,7 @@ def check(problem, cloud, t, steps, tol, order, scheme, throw, progress) -> None
     if not is_traced(t):
         try:
             t0, t1 = (float(v) for v in t)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             raise ValueError(f"t: expected two numbers, t=(t0, t1), got {short(t)}") from None
         if not (np.isfinite(t0) and np.isfinite(t1)) or t1 <= t0:
             raise ValueError(f"t: expected finite times with t0 < t1, got ({t0:g}, {t1:g})")
@@ -70,7 +70,7 @@ def saved_times(save: Any, t0: float, t1: float) -> np.ndarray:
         return np.linspace(0.0, 1.0, int(save) + 1)
     try:
         times = np.asarray(save, float)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise ValueError(f"save: expected a number of intervals or an array of times, got {short(save)}") from None
     if times.ndim != 1 or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
         raise ValueError(f"save: expected a number of intervals or ascending finite times, got {short(save)}")
@@ -110,7 +110,7 @@ def _values(given: Any, cloud: Cloud, fields: int, name: str) -> Any:
         refuse_masked(given, name)
         try:
             values = given if is_traced(given) else np.array(given, float)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             raise ValueError(f"{name}: expected a function of x, a number or an array, got {short(given)}") from None
         if np.ndim(values) == 0 or (fields > 1 and np.shape(values) == (fields,)):
             values = (jnp if is_traced(values) else np).broadcast_to(values, (n, fields))

@@ -16,14 +16,14 @@ from jsmitsm.evolution.steps import dense_output
 from jsmitsm.runtime import notebooks
 from jsmitsm.runtime.arrays import Array
 from jsmitsm.runtime.errors import explained, explaining
-from jsmitsm.runtime.tracers import frozen, is_traced
+from jsmitsm.runtime.tracers import Copied, frozen, is_traced
 from jsmitsm.solution.fit import Recipe
 from jsmitsm.solution.regions.solution import RegionsSolution
 from jsmitsm.solution.solution import Solution
 
 
 @jax.tree_util.register_pytree_node_class
-class Evolution:
+class Evolution(Copied):
     """A solution in time, at saved moments and between them.
 
 
@@ -83,6 +83,7 @@ class Evolution:
         return self._rate[..., 0] if self._recipe.fields == 1 else self._rate
 
     @property
+    @explaining
     def flags(self) -> list[str]:
         """What speaks against this evolution, a sentence each."""
         return [] if self._report is None else explained(self._report.flags)
@@ -159,7 +160,7 @@ class Evolution:
             raise ValueError("at: inside of a JAX transform, or of what jax.vmap made, only .t and .u can be read")
         try:
             time = float(t)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             raise ValueError(f"t: expected a number, got {t!r}") from None
         times, values = (np.asarray(self.t), np.asarray(self._u)) if self._history is None else self._history
         slack = 1e-12 * (times[-1] - times[0])

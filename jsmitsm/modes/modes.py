@@ -19,7 +19,7 @@ from jsmitsm.modes.spectrum import Pairs
 from jsmitsm.runtime import notebooks
 from jsmitsm.runtime.arrays import Array, ArrayLike
 from jsmitsm.runtime.errors import explained, explaining, short, some
-from jsmitsm.runtime.tracers import frozen, is_traced, owned
+from jsmitsm.runtime.tracers import Copied, frozen, is_traced, owned
 from jsmitsm.solution.fit import Fit, Recipe
 from jsmitsm.solution.regions.fit import RegionsFit
 from jsmitsm.solution.regions.solution import RegionsSolution
@@ -32,7 +32,7 @@ LOOSE = 1e3
 
 
 @jax.tree_util.register_pytree_node_class
-class Modes:
+class Modes(Copied):
     """Eigenvalues and modes of an operator, by their distance from what was asked for.
 
     ``modes(j, points)`` evaluates mode j at points (M, D), ``modes.grad(j, points)`` its gradient: by local Taylor

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import difflib
+import functools
 import re
 import sys
-from collections.abc import Iterable, Sequence
-from contextlib import ContextDecorator
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from types import TracebackType
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
 
+_Function = TypeVar("_Function", bound=Callable[..., Any])
 # What a user's function may raise when it is called.
 IN_FUNCTIONS = (TypeError, ValueError, IndexError, AttributeError, ArithmeticError, RecursionError)
 # What a flag says, in words that no other one has, and where docs/symptoms.md explains it.
@@ -129,12 +131,22 @@ def explained(flags: Iterable[str]) -> list[str]:
     return out
 
 
-class _Explaining(ContextDecorator):
+class _Explaining:
     """``@explaining``: what this public function refuses ends with the place in the documentation that helps.
+
+    A user's setting of how JAX promotes ranks is about arrays of the user's, and does not reach into it.
 
     Functions that stand in a user's residuals have it in their messages instead: there this would be one more frame
     between the user's line and what is recorded of it.
     """
+
+    def __call__(self, function: _Function) -> _Function:
+        @functools.wraps(function)
+        def explained(*args: Any, **options: Any) -> Any:
+            with self, _ranks_promoted():
+                return function(*args, **options)
+
+        return explained  # type: ignore[return-value]
 
     def __enter__(self) -> None: ...
 
@@ -145,6 +157,11 @@ class _Explaining(ContextDecorator):
 
 
 explaining = _Explaining()
+
+
+def _ranks_promoted() -> AbstractContextManager[Any]:
+    """Nothing where that is so: entering JAX's own would make programs of their own."""
+    return nullcontext() if jax.config.read("jax_numpy_rank_promotion") == "allow" else jax.numpy_rank_promotion("allow")
 
 
 def _package(trace: TracebackType | None) -> str | None:
@@ -261,6 +278,20 @@ def numbers(name: str, value: Any) -> np.ndarray:
         return np.asarray(value, float)
     except (TypeError, ValueError, OverflowError):
         raise ValueError(f"{name}: expected numbers, got {short(value)}") from None
+
+
+def listed(name: str, value: Any, expected: str) -> list[Any]:
+    """What stands in a sequence, refused in words where it is none.
+
+    >>> listed("holes", 3, "polygons")
+    Traceback (most recent call last):
+      ...
+    ValueError: holes: expected polygons, in a list, got 3
+    """
+    try:
+        return list(value)
+    except TypeError:
+        raise ValueError(f"{name}: expected {expected}, in a list, got {short(value)}") from None
 
 
 def is_whole(value: Any, least: float = -np.inf, most: float = np.inf) -> bool:

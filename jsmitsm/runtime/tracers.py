@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 from contextlib import AbstractContextManager, nullcontext
-from typing import Any
+from typing import Any, Self
 
 import jax
 import jax.numpy as jnp
@@ -62,6 +63,20 @@ def frozen(x: Any) -> Any:
     if isinstance(x, np.ndarray):
         x.setflags(write=False)
     return x
+
+
+class Copied:
+    """Copied with all that it knows, though pickled without its records: its arrays are read-only, and shared."""
+
+    def __copy__(self) -> Self:
+        new = object.__new__(type(self))
+        new.__dict__.update(self.__dict__)
+        return new
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Self:
+        new = self.__copy__()
+        new.__dict__["stats"] = copy.deepcopy(self.__dict__["stats"], memo)
+        return new
 
 
 def concrete(x: Any) -> Any:

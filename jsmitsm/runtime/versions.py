@@ -30,6 +30,8 @@ def show_versions(file: TextIO | None = None) -> None:
     """
     import jax
 
+    if not (file is None or hasattr(file, "write")):
+        raise ValueError(f"file: expected a text file or None, got {file!r}; open(..., 'w') makes one")
     lines = [("jsmitsm", _version("jsmitsm")), ("python", sys.version.split()[0]), ("system", platform.platform())]
     lines += [("cores", str(os.cpu_count()))]
     lines += [(name, _version(name)) for name in _NEEDED + _EXTRAS]

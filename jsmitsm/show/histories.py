@@ -46,7 +46,7 @@ def sparsity(what: Any, *, ax: Any = None) -> Any:
 
         try:
             matrix = coo_matrix(what)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             raise ValueError(
                 f"what: expected js.Stencils, a js.Solution or a matrix, got {type(what).__name__}"
             ) from None

@@ -16,6 +16,9 @@ from jsmitsm.show.su2 import read_su2
 _OWN = {".su2": read_su2, ".inp": read_abaqus}
 # What meshio prints and a cloud does not need: the partitions of a Gmsh mesh.
 _HARMLESS = ("tag data that couldn't be processed",)
+# Where lines of these are missing meshio looks for them for ever.
+_BY_LINES = {".dat": "tecplot", ".tec": "tecplot", ".mdpa": "mdpa"}
+_TETGEN = (".node", ".ele")  # one mesh in two files
 
 
 def needed(name: str, extra: str) -> Any:
@@ -31,16 +34,21 @@ def read_mesh(path: Any) -> Any:
     name = os.fsdecode(path)
     extension = os.path.splitext(name)[1].lower()
     meshio = None if extension in _OWN else needed("meshio", "mesh")
-    if not os.path.isfile(name):
-        raise ValueError(f"mesh: there is no file {name!r}; give the path of a mesh file")
     kind = _checked_kind(name, extension)
+    for part in _TETGEN if extension in _TETGEN else ():
+        _checked_kind(os.path.splitext(name)[0] + part, part)
     said = io.StringIO()
     try:
         with contextlib.redirect_stderr(said), contextlib.redirect_stdout(said), warnings.catch_warnings():
             # numpy stops at what is no number, and meshio goes on with what came before.
             warnings.simplefilter("ignore")
             warnings.filterwarnings("error", message=".*could not be read to its end")
-            mesh = _OWN[extension](name) if meshio is None else meshio.read(name, kind)
+            if meshio is None:
+                mesh = _OWN[extension](name)
+            elif extension in _BY_LINES:
+                mesh = _read_by_lines(meshio, name, _BY_LINES[extension])
+            else:
+                mesh = meshio.read(name, kind)
     except ModuleNotFoundError as error:
         raise ImportError(f"mesh: meshio needs {error.name} for {name!r}: pip install {error.name}") from None
     except (Exception, SystemExit) as error:
@@ -60,13 +68,43 @@ def read_mesh(path: Any) -> Any:
     return mesh
 
 
+class _Ending:
+    """A file that refuses to be read far beyond its end; a few empty lines there tell a reader that it has ended."""
+
+    _beyond = 0
+
+    def readline(self, *size: Any) -> Any:
+        line = super().readline(*size)  # type: ignore[misc]
+        self._beyond += not line
+        if self._beyond > 9:
+            raise EOFError("it is cut short")
+        return line
+
+
+class _Lines(_Ending, io.TextIOWrapper): ...  # type: ignore[misc]
+
+
+class _Bytes(_Ending, io.BufferedReader): ...  # type: ignore[misc]
+
+
+def _read_by_lines(meshio: Any, name: str, kind: str) -> Any:
+    file = _Bytes(io.FileIO(name))
+    with file if kind == "mdpa" else _Lines(file) as lines:
+        return meshio.read(lines, kind)
+
+
 def _checked_kind(name: str, extension: str) -> str | None:
     """Which of the two formats of .msh a file has; refuse a file that is empty or ends too soon."""
+    if not os.path.isfile(name):
+        raise ValueError(f"mesh: there is no file {name!r}; give the path of a mesh file")
+    if extension == ".wkt":
+        raise ValueError(f"mesh: {name!r}: meshio may search a damaged WKT for ever; write the mesh as .msh, .vtk or "
+                         ".vtu, and give the text of a polygon to js.files.from_shapely")  # fmt: skip
     with open(name, "rb") as file:
         start = file.read(1)
         file.seek(-min(os.path.getsize(name), 100), os.SEEK_END)
         end = file.read().split()
-        if extension in (".node", ".ele"):  # comments alone are nothing either
+        if extension in _TETGEN:  # comments alone are nothing either
             file.seek(0)
             end = [line for line in file if not line.strip().startswith(b"#") and line.strip()]
     kind = {b"$": "gmsh", b"(": "ansys"}.get(start) if extension == ".msh" else None

@@ -13,12 +13,12 @@ from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.cloud.quadrature import quadrature
 from jsmitsm.runtime.arrays import ArrayLike, ValueOrFunction
 from jsmitsm.runtime.errors import explaining
-from jsmitsm.runtime.tracers import frozen, is_traced
+from jsmitsm.runtime.tracers import Copied, frozen, is_traced
 from jsmitsm.solution.evaluation import checked_points, evaluated, in_domain, nearest_particles
 from jsmitsm.solution.fit import Recipe
 
 
-class Anywhere:
+class Anywhere(Copied):
     """Local Taylor polynomials ``_taylor`` (N, F, K) about the particles of a cloud, and what follows from them."""
 
     cloud: Cloud
@@ -44,6 +44,7 @@ class Anywhere:
             )
 
     @property
+    @explaining
     def _taylor(self) -> Any:
         """Taylor coefficients (N, F, K)."""
         self.refuse_stacked()

@@ -57,7 +57,7 @@ def checked_points(points: Any, dim: int) -> Any:
             if np.iscomplexobj(points):
                 raise TypeError
             points = np.asarray(points, dtype=float)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             raise ValueError(
                 f"points: expected real numbers of shape (M, {dim}), got {type(points).__name__}"
             ) from None

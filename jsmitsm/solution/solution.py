@@ -222,6 +222,7 @@ class Solution(Anywhere):
         return self._share if np.isfinite(self._share) else np.inf
 
     @property
+    @explaining
     def flags(self) -> list[str]:
         """What speaks against this solution, a sentence each; none for a healthy one.
 

@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from jsmitsm.runtime.errors import short
+
 MultiIndex = tuple[int, ...]
 Slot = tuple[int, MultiIndex]
 """A derivative of a field: the field and the multi-index."""
@@ -17,7 +19,6 @@ Slot = tuple[int, MultiIndex]
 HIGHEST = 14
 
 
-@cache
 def multi_indices(dim: int, degree: int) -> tuple[MultiIndex, ...]:
     """All multi-indices up to a total degree, graded.
 
@@ -38,17 +39,25 @@ def multi_indices(dim: int, degree: int) -> tuple[MultiIndex, ...]:
     Raises
     ------
     ValueError
-        If ``dim`` is below 1 or ``degree`` no whole number.
+        If ``dim`` or ``degree`` is no whole number, or there are more than ten million.
 
     Examples
     --------
     >>> multi_indices(2, 2)
     ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
     """
-    if isinstance(degree, bool) or not isinstance(degree, (int, float, np.integer)) or int(degree) != degree:
-        raise ValueError(f"degree: expected a whole number, got {degree!r} (docs: choosing)")
-    if not isinstance(dim, (int, float, np.integer)) or dim < 1:
-        raise ValueError(f"dim must be at least 1, got {dim!r} (docs: choosing)")
+    for name, value in (("dim", dim), ("degree", degree)):
+        if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
+            raise ValueError(f"{name}: expected a whole number, got {short(value)} (docs: choosing)")
+    if not 1 <= dim <= 99:
+        raise ValueError(f"dim: expected a number of axes, 1 to 99, got {short(dim)} (docs: choosing)")
+    if degree > 10_000_000 or degree > 0 and math.comb(int(dim + degree), int(dim)) > 10_000_000:
+        raise ValueError("degree: there are more than ten million multi-indices; lower it (docs: choosing)")
+    return _up_to(int(dim), int(degree))
+
+
+@cache
+def _up_to(dim: int, degree: int) -> tuple[MultiIndex, ...]:
     return tuple(a for d in range(degree + 1) for a in _of_degree(dim, d))
 
 

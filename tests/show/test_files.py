@@ -259,7 +259,8 @@ def test_what_is_no_mesh_file(name, tmp_path):
         from_mesh(path)
 
 
-@pytest.mark.parametrize("form, kind", [("msh", "gmsh"), ("msh", "gmsh22"), ("vtk", "vtk"), ("vtu", "vtu")])
+@pytest.mark.parametrize("form, kind", [("msh", "gmsh"), ("msh", "gmsh22"), ("vtk", "vtk"), ("vtu", "vtu"),
+                                        ("tec", "tecplot"), ("mdpa", "mdpa")])  # fmt: skip
 def test_a_file_cut_short(form, kind, tmp_path):
     path = tmp_path / f"whole.{form}"
     meshio.Mesh(np.pad(CORNERS, ((0, 0), (0, 1))), [FAN]).write(path, file_format=kind)
@@ -269,6 +270,19 @@ def test_a_file_cut_short(form, kind, tmp_path):
         path.write_bytes(whole[: int(part * len(whole))])
         with pytest.raises(ValueError, match="mesh: .*(cut short|cannot read|has no cells|name nodes)"):
             from_mesh(path)
+
+
+def test_what_meshio_would_read_for_ever(tmp_path):
+    """A text of triangles, and TetGen's two files of which one is empty or missing."""
+    (tmp_path / "a.wkt").write_text("TIN (((0 0, 1 0")
+    with pytest.raises(ValueError, match="mesh: .*WKT.*write the mesh as .msh"):
+        from_mesh(tmp_path / "a.wkt")
+    (tmp_path / "a.node").write_text("4 3 0 0\n0 0 0 0\n1 1 0 0\n2 0 1 0\n3 0 0 1\n")
+    with pytest.raises(ValueError, match="mesh: there is no file .*a.ele"):
+        from_mesh(tmp_path / "a.node")
+    (tmp_path / "a.ele").write_text("# nothing\n")
+    with pytest.raises(ValueError, match="mesh: the file .*a.ele' is empty"):
+        from_mesh(tmp_path / "a.node")
 
 
 def test_shapely_polygon_and_text():

@@ -186,3 +186,34 @@ def test_kernel_and_stencils_changed_in_place():
     h[:], near.indices[:] = 3.0, 0
     for s in (sol, other):
         np.testing.assert_allclose(s.grad([[0.0]])[0, 0], -0.5, rtol=1e-9)
+
+
+def test_a_cloud_of_regions_is_not_changed():
+    """Nor what came out of a file or a program with it."""
+    made = js.regions({"a": (0.0, 0.5), "b": (0.5, 1.0)}, spacing=0.125)
+    for cloud in (made, pickle.loads(pickle.dumps(made)), jax.tree.map(lambda x: x, made)):
+        with pytest.raises(ValueError, match="read-only"):
+            cloud.interface_normals["a|b"][0] = -1.0
+        with pytest.raises(TypeError):
+            cloud.interface_normals["a|b"] = cloud.normals
+        for name in ("interface_normals", "interfaces", "regions"):
+            with pytest.raises(AttributeError, match=f"{name}: a RegionCloud does not change; make another one"):
+                setattr(cloud, name, {})
+
+
+@pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy])
+def test_a_copy_knows_what_the_solution_knows(copied):
+    sol = js.solve(js.Problem(lambda u, x: js.laplacian(u)(x) - 1.0, ENDS), ROD)
+    other = copied(sol)
+    assert (other.error_estimate() == sol.error_estimate()).all() and other.flags == sol.flags
+    np.testing.assert_array_equal(other.condition_numbers()[0], sol.condition_numbers()[0])
+
+
+def test_a_setting_of_ranks_is_about_the_arrays_of_the_user():
+    problem = js.Problem(lambda u, x: js.laplacian(u)(x) - 1.0, ENDS)
+    with jax.numpy_rank_promotion("raise"):
+        sol = js.solve(problem, js.interval(0.0, 1.0, len(ROD)))
+        assert sol.flags == [] and sol.coefficients.shape[0] == len(ROD)
+        assert (np.asarray(sol(POINTS)) == np.asarray(js.solve(problem, ROD)(POINTS))).all()
+        with pytest.raises(ValueError, match="rank_promotion"):
+            jnp.ones((2, 1)) + jnp.ones(1)

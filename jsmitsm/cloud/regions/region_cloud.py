@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import jax
@@ -12,6 +12,25 @@ from jsmitsm.cloud.cloud import INTERIOR, Cloud, Groups, checked_groups, checked
 from jsmitsm.runtime.arrays import Array, ArrayLike
 from jsmitsm.runtime.errors import did_you_mean, some
 from jsmitsm.runtime.tracers import is_traced, owned
+
+
+class Normals(Mapping[str, Any]):
+    """Unit normals (P, D) of every interface; read-only."""
+
+    def __init__(self, normals: Mapping[str, Any]):
+        self._normals = {name: owned(values) for name, values in normals.items()}
+
+    def __getitem__(self, name: str) -> Any:
+        return self._normals[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._normals)
+
+    def __len__(self) -> int:
+        return len(self._normals)
+
+    def __repr__(self) -> str:
+        return repr(self._normals)
 
 
 @jax.tree_util.register_pytree_node_class
@@ -26,8 +45,8 @@ class RegionCloud(Cloud):
     points, groups, normals : array (N, D), mapping, array (N, D)
         As those of ``js.Cloud``. Interfaces are groups too, ``"a|b"``, of the
         copies of both sides; the normal of both is that from a to b.
-    regions : tuple of str
-        Mapping Maps a name to the particles of that region, in ascending order; every particle belongs to one.
+    regions : mapping
+        Maps a name to the particles of that region, in ascending order; every particle belongs to one.
     interfaces : mapping
         Maps ``"a|b"`` to the pairs (P, 2) of particles, first that in a. A particle where several
         interfaces meet is in several pairs, and one at the end of an interface may belong to a group of the outer
@@ -42,6 +61,8 @@ class RegionCloud(Cloud):
     >>> cloud.interfaces["a|b"], len(cloud.region("a"))
     (array([[4, 8]]), 5)
     """
+
+    _fixed = (*Cloud._fixed, "regions", "interfaces", "interface_normals")
 
     def __init__(
         self,
@@ -60,9 +81,12 @@ class RegionCloud(Cloud):
         self.groups = checked_groups(groups, len(self.points))
         self.normals: Array | None = checked_normals(normals, self.points, self.groups)
         self.interfaces = Groups({name: np.asarray(pairs) for name, pairs in interfaces.items()})
-        self.interface_normals: dict[str, Any] = {k: np.asarray(v, float) for k, v in interface_normals.items()}
+        self.interface_normals = Normals({name: np.asarray(n, float) for name, n in interface_normals.items()})
         self._spacing: float | None = None
         _check_pairs(self, owner)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__({**state, "interface_normals": Normals(state["interface_normals"])})
 
     @property
     def spacing(self) -> float:
@@ -147,10 +171,11 @@ class RegionCloud(Cloud):
         new.groups, new.regions, new.interfaces = self.groups, self.regions, self.interfaces
         owner = _owner(self)
         new.points = self.points if points is None else checked_points(points, owner)
-        new.normals, new.interface_normals = self.normals, self.interface_normals
-        if normals is not None:
-            new.normals = checked_normals(normals, new.points, self.groups)
-            new.interface_normals = {name: _renewed(self, new.normals, name) for name in self.interfaces}
+        new.normals = self.normals if normals is None else checked_normals(normals, new.points, self.groups)
+        if normals is None:
+            new.interface_normals = self.interface_normals
+        else:
+            new.interface_normals = Normals({name: _renewed(self, new.normals, name) for name in self.interfaces})
         new._spacing = None if points is not None else self._spacing
         if not is_traced(new.points):
             _check_pairs(new, owner)
@@ -160,13 +185,13 @@ class RegionCloud(Cloud):
         return f"RegionCloud({len(self)} particles in {self.dim}D, regions {self.regions!r}, groups {self.groups!r})"
 
     def tree_flatten(self):
-        return (self.points, self.normals, self.interface_normals), (self.groups, self.regions, self.interfaces)
+        return (self.points, self.normals, dict(self.interface_normals)), (self.groups, self.regions, self.interfaces)
 
     @classmethod
     def tree_unflatten(cls, static, leaves):
         new = object.__new__(cls)
-        points, normals, new.interface_normals = leaves
-        new.points, new.normals = owned(points), owned(normals)
+        points, normals, between = leaves
+        new.points, new.normals, new.interface_normals = owned(points), owned(normals), Normals(between)
         new.groups, new.regions, new.interfaces = static
         new._spacing = None
         return new

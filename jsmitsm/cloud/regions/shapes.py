@@ -122,7 +122,7 @@ def shape_of(name: str, given: Any, bounds: Any, spacing: Spacing) -> Shape:
         return Polygons(where, _shapely_loops(where, given), spacing)
     try:
         array = np.asarray(given, float)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         array = np.zeros((0, 0, 0))
     if array.shape == (2,) and np.isfinite(array).all() and array[0] < array[1]:
         return Interval(float(array[0]), float(array[1]))

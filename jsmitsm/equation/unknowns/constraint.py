@@ -87,7 +87,7 @@ def checked_number(value: Any, name: str) -> Any:
         array = np.asarray(value)
         if array.dtype.kind not in "fiu" or array.ndim:
             raise TypeError
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise ValueError(f"{name}: expected a number, got {short(value)}") from None
     if not np.isfinite(array):
         raise ValueError(f"{name}: NaN or infinite; give a finite number")

@@ -16,7 +16,7 @@ import numpy as np
 from jsmitsm.equation.unknowns.constraint import Constraint, checked_number
 from jsmitsm.equation.unknowns.integral import Kernels, kernels
 from jsmitsm.equation.unknowns.point_source import PointSource
-from jsmitsm.runtime.errors import short
+from jsmitsm.runtime.errors import listed, short
 
 
 @partial(
@@ -59,7 +59,8 @@ def extras(
             f"constraints: {len(started)} unknown(s), {', '.join(map(repr, started))}, and no constraint; give one "
             "js.constraint(functional, value) for each"
         )
-    complex_values, points = _is_complex(dtype), [sources] if isinstance(sources, PointSource) else list(sources)
+    complex_values = _is_complex(dtype)
+    points = [sources] if isinstance(sources, PointSource) else listed("sources", sources, "js.point_source(...)s")
     for k, source in enumerate(points):
         if not isinstance(source, PointSource):
             raise ValueError(f"sources[{k}]: expected js.point_source(x0, strength), got {short(source)}")

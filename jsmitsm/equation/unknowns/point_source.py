@@ -92,7 +92,7 @@ def point_source(x0: ArrayLike, strength: ArrayLike = 1.0) -> PointSource:
         refuse_masked(x0, "x0")
         try:
             place = np.asarray(x0, float)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             raise ValueError(f"x0: expected one point (D,), got {short(x0)}") from None
         if not np.isfinite(place).all():
             raise ValueError("x0: NaN or infinite coordinates; give a point of the domain")
