@@ -161,7 +161,8 @@ explaining = _Explaining()
 
 def _ranks_promoted() -> AbstractContextManager[Any]:
     """Nothing where that is so: entering JAX's own would make programs of their own."""
-    return nullcontext() if jax.config.read("jax_numpy_rank_promotion") == "allow" else jax.numpy_rank_promotion("allow")
+    asked = jax.config.jax_numpy_rank_promotion  # type: ignore[attr-defined]
+    return nullcontext() if asked == "allow" else jax.numpy_rank_promotion("allow")
 
 
 def _package(trace: TracebackType | None) -> str | None:
