@@ -32,12 +32,11 @@ from jsmitsm.runtime.size_classes import BLOCK
 from jsmitsm.runtime.threads import cores, side_by_side
 from jsmitsm.runtime.tracers import is_traced, recorded
 
-# Options as pairs; None: f runs as it stands, in numpy, and its derivatives are compiled with little effort, or the
-# least where no array has more numbers than these: they run as fast, and are compiled in half the time.
+# Options as pairs; None: f runs as it stands, in numpy, and its derivatives are compiled with little effort. With the
+# least they would be compiled in half the time, but what is computed twice differs by rounding there: the slope of a
+# maximum, which looks for the entry that equals it, was zero now and then.
 Options = tuple[tuple[str, Any], ...] | None
-LITTLE: Any = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 1}
-LEAST: Any = LITTLE | {"xla_backend_optimization_level": 0}
-_FEW = 1 << 17
+_LITTLE: Any = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 1}
 _KEPT = 1024
 # Rows that are worth a core of their own.
 _WORTH = 1000
@@ -173,11 +172,11 @@ class Program:
             return jax.tree.unflatten(result.tree, jaxpr_as_fun(result.closed)(*arguments))
 
         part.__name__ = name
+        if options is None:
+            options = tuple(on_cpu(_LITTLE).items())
         function.__name__ = name
         if base:
             function = _to_be_run(function)
-        self.quick = jax.jit(function, compiler_options=on_cpu(LEAST)) if options is None else None
-        options = tuple(on_cpu(LITTLE).items()) if options is None else options
         self.part, self.compiled = part, jax.jit(function, compiler_options=dict(options))
         if small:
             self.kernel = jax.jit(one_kernel.one_kernel(function), compiler_options=dict(options) | one_kernel.OPTIONS)
@@ -192,8 +191,6 @@ class Program:
         config: Any = jax.config
         if config.jax_disable_jit:  # step by step: what a compiled program makes of numpy's arrays by itself
             return self.function(*map(jnp.asarray, arguments))
-        if self.quick is not None and all(np.size(x) <= _FEW for x in arguments):
-            return self.quick(*arguments)
         if not self.small:
             return self.compiled(*arguments)
         try:

@@ -77,6 +77,8 @@ class FirstDegree:
                 for v, w in zip(eqn.outvars, body.outvars, strict=True):
                     places[v], active[v] = self._place(w, there), not isinstance(w, Literal) and below[w]
                 continue
+            if len(eqn.outvars) != 1:  # a loop
+                raise Unknown
             (out,) = eqn.outvars
             still = level == CONSTANT_TERM or eqn.primitive.name in DISCRETE
             rule = _rule(eqn, moving)

@@ -901,7 +901,7 @@ def a_spline(patch, path):
 
 @way
 def a_function_of_numpy_replaced(patch, path):
-    return lambda: np.sum(np.ones(1)), lambda: patch.setattr(np, "sum", lambda x: 2.0)
+    return lambda: np.nanmean(np.ones(1)), lambda: patch.setattr(np, "nanmean", lambda x: 2.0)
 
 
 @way
