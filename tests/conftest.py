@@ -34,6 +34,9 @@ def usual_effort(monkeypatch):
         monkeypatch.setattr(batches, name, value)
 
 
+# Tracing makes objects by the million that nothing else holds: a collection every 700 of them is a twelfth of the time.
+gc.set_threshold(20_000, 20, 20)
+
 # Compiled programs hold memory maps, of which Linux gives a process 65530: a whole suite would run out of them.
 MAPS = 25_000
 
