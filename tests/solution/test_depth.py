@@ -162,14 +162,15 @@ def test_a_kink_outside_of_the_domain_changes_nothing():
 
 @pytest.mark.parametrize("formulation, bent", [("loo", False), ("lsq", False), ("loo", True)])
 def test_gradients_through_a_deep_solve(formulation, bent):
-    """With respect to a coefficient and a source, against differences."""
+    """With respect to a coefficient and a source, against differences; of values and slopes between particles too."""
 
     def value(a):
         bend = jnp.abs if bent else jnp.sin
         pde = lambda u, x, a: js.laplacian(u)(x) + a * jnp.exp(x[0]) * u(x) - a**2 * bend(7.0 * x[0] - a)
         ends = {"left": js.dirichlet(1.0), "right": js.dirichlet(lambda x, a: a)}
         sol = js.solve(js.Problem(pde, ends, params=a), ROD, order=4, depth=4, formulation=formulation)
-        return jnp.sum(sol.u**2) + sol(jnp.array([[0.33]]))[0]
+        at = jnp.array([[0.33]])
+        return jnp.sum(sol.u**2) + sol(at)[0] + 0.1 * sol.grad(at)[0, 0]
 
     step = 1e-5
     expected = (value(3.0 + step) - value(3.0 - step)) / (2 * step)
