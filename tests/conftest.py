@@ -22,7 +22,7 @@ from jsmitsm.particle import batches
 jax.config.update("jax_enable_x64", True)
 
 # What a test compiles it runs once or twice: the local phase is compiled as for a few particles, and not as one kernel,
-# which test_onekernel.py has. Processes of their own (notebooks, users' scripts) have the usual effort.
+# which test_onekernel.py has. Processes of their own, as scripts of users, have the usual effort.
 USUAL = {"EFFORT": batches.EFFORT, "SMALL": batches.SMALL}
 batches.EFFORT, batches.SMALL = ((np.inf, batches.QUICKLY),), 0
 
