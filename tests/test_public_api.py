@@ -8,6 +8,7 @@ import pathlib
 import pickle
 import subprocess
 import sys
+from contextlib import contextmanager
 
 import jax
 import jax.numpy as jnp
@@ -293,6 +294,31 @@ def given(cloud, factor=1.0):
     return {"h": factor * h, "d": 3.0, "k": 0.3 * factor, "wall": 0.5 * factor, "points": cloud.points}
 
 
+@contextmanager
+def compiling():
+    """What is compiled, as JAX tells it."""
+    names = []
+    logger = logging.getLogger("jax._src.interpreters.pxla")
+    handler = logging.Handler()
+    handler.emit = lambda record: names.append(record.getMessage())
+    logger.addHandler(handler)
+    try:
+        with jax.log_compiles():
+            yield names
+    finally:
+        logger.removeHandler(handler)
+
+
+def test_a_gradient_runs_the_local_phase_that_the_solve_compiled():
+    value, here = total(CLOUD, js.stencils(CLOUD, size=9)), given(CLOUD)
+    by_k = lambda k: value({**here, "k": k})  # noqa: E731
+    by_k(0.3)
+    with compiling() as names:
+        jax.grad(by_k)(0.3)
+    assert any("Compiling jit(pulled_moved_rows)" in name for name in names), "nothing was listened to"
+    assert not [name for name in names if "Compiling jit(rows)" in name]
+
+
 @pytest.fixture(scope="module")
 def graded():
     """The programs of a first gradient."""
@@ -313,17 +339,9 @@ def test_a_gradient_on_a_cloud_of_similar_size_reuses_the_local_phase(graded):
     """Its derivative too: what is compiled is small, for the exact shapes of the global system."""
     cloud = mm.jittered(1, len(CLOUD) + 1, seed=5)
     assert padded_size(len(cloud)) == padded_size(len(CLOUD))
-    names = []
-    logger = logging.getLogger("jax._src.interpreters.pxla")
-    handler = logging.Handler()
-    handler.emit = lambda record: names.append(record.getMessage())
-    logger.addHandler(handler)
     traces = dict(batches.TRACES)
-    try:
-        with jax.log_compiles():
-            jax.grad(total(cloud, js.stencils(cloud, size=9)))(given(cloud))
-    finally:
-        logger.removeHandler(handler)
+    with compiling() as names:
+        jax.grad(total(cloud, js.stencils(cloud, size=9)))(given(cloud))
     assert batches.TRACES == traces
     assert any("Compiling jit(pulled_moved__entries)" in name for name in names), "nothing was listened to"
     assert not [name for name in names if "rows)" in name]

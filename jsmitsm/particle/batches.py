@@ -134,12 +134,13 @@ def _in_size_classes(function: Any) -> Any:
         # What is only run stops after m particles; derivatives are taken of all.
         inside = recorded()
         loose = not (inside or is_traced(points, kernel, ids, neighbours, operands, each, whole))
-        form = scheme, big, neighbours.shape[1], jac.shape[1:], one_for_all, operands.shared is None, loose
+        # What is differentiated is run first, by the same program where that has no more rows than it should.
+        form = scheme, big, neighbours.shape[1], jac.shape[1:], one_for_all, operands.shared is None, inside
         known = compiled.setdefault(form, set())
         if loose:
             size = at_hand(known, m, largest_at_hand(m), open_size(m))
         else:
-            size = at_hand(known, m, 1.25 * m, padded_size(m))
+            size = at_hand(known, m, max(1.25 * m, FEW), padded_size(m))
         mesh = devices.of_rows(m) if loose else None
         if mesh is not None:
             size = -(-size // mesh.size) * mesh.size
@@ -160,7 +161,7 @@ def _in_size_classes(function: Any) -> Any:
         options = effort(size, len(fit_and_tail(scheme.rec)[0]))
         few = operands.shared is not None and scheme.rec.size * scheme.rec.fields <= SMALL
         small = few and one_kernel.available()
-        share = None if loose else dict(zip(names, _by_row(points, kernel, ids, neighbours, given, each, whole)))
+        share = dict(zip(names, _by_row(points, kernel, ids, neighbours, given, each, whole)))
         return cut(called(function, {"scheme": scheme}, arguments, tuple(options.items()), small, share), m)
 
     return padded

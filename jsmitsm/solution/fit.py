@@ -54,13 +54,16 @@ class Fit:
         return discretize(self.problem, self.cloud, r.method, r.order, self.kernel, near, r.basis_terms, depth=r.depth)
 
     @bar("fitting")
-    def coefficients(self, values: Any) -> Any:
-        """Taylor coefficients (N, F, K) of every particle."""
+    def coefficients(self, values: Any, about: Any = None) -> Any:
+        """Taylor coefficients (N, F, K) of every particle.
+
+        about: other values (N, F) whose polynomials are what held particles of a nonlinear problem are linearised at.
+        """
         disc, taylor = self.discretization(), self.taylor
         held = held_particles(disc)
         if taylor is not None and len(held):
             # Those of held particles are continued from others; fitted where that is linearised they are their own.
-            fitted = self._fitted(disc, held, taylor, values)
+            fitted = self._fitted(disc, held, taylor, values if about is None else about)
             alone = np.isin(disc.partner, held)[:, None, None]
             taylor = (jnp if is_traced(fitted, taylor) else np).where(alone, fitted, taylor)
         return self._fitted(disc, np.flatnonzero(disc.partner == np.arange(len(self.cloud))), taylor, values)

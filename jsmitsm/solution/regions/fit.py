@@ -33,13 +33,16 @@ class RegionsFit:
         return discretize_regions(self.problem, self.cloud, r.order, r.depth, np.asarray(self.neighbours))
 
     @bar("fitting")
-    def coefficients(self, values: Any) -> Any:
-        """Taylor coefficients (N, F, K) of every particle, of those with held values too."""
+    def coefficients(self, values: Any, about: Any = None) -> Any:
+        """Taylor coefficients (N, F, K) of every particle, of those with held values too.
+
+        about: other values (N, F) whose polynomials are what held particles of a nonlinear problem are linearised at.
+        """
         regions, taylor = self.discretization(), self.taylor
         bound = {i for m in regions.meetings for i in m.copies}
         if taylor is not None and regions.held.all(axis=1).any():
             # Those of held particles are continued from others; fitted where that is linearised they are their own.
-            fitted = self._fitted(regions, bound, taylor, values)
+            fitted = self._fitted(regions, bound, taylor, values if about is None else about)
             held = np.zeros(len(self.cloud), bool)
             for p in regions.parts:
                 held[p.ids[held_particles(p.disc)]] = True

@@ -94,9 +94,8 @@ def solve_constrained(
     if not lines.constraints:
         x, good = _solved(run, answer)
         return _finished(run, start, with_held(run.disc, answer.nums, x), None, good, 1, recipe, again)
-    unknowns, values, good, steps = _linearly(run, lines, answer, start)
+    unknowns, values, good, linearly, steps = _linearly(run, lines, answer, start)
     if start:
-        linearly = _entered_linearly(run, answer, start, unknowns)
         known = concrete(linearly)
         if _bends(run, start) if known is None else not bool(known):
             run.go(start)
@@ -105,13 +104,17 @@ def solve_constrained(
     return _finished(run, unknowns, values, None, good, steps, recipe, again)
 
 
-def _linearly(run: Bordered, lines: Lines, answer: Response, start: dict[str, Any]) -> tuple[Any, Any, Any, int]:
-    """Unknowns, values, whether the constraints are met, and the steps; equation and conditions are linear in both."""
+def _linearly(run: Bordered, lines: Lines, answer: Response, start: dict[str, Any]) -> tuple[Any, Any, Any, Any, int]:
+    """Unknowns, values, whether the constraints are met, whether the unknowns entered linearly, and the steps.
+
+    Equation and conditions are taken to be linear in both; where they are not it ends.
+    """
     disc, names, count = run.disc, lines.names, len(lines.constraints)
     run.columns = run.constants() if run.multipliers else -answer.columns
     free = np.flatnonzero(~disc.held.reshape(-1))
     # Linear constraints do not care where they are linearised; others must not have a flat spot there.
     unknowns, values, good = start, with_held(disc, answer.nums, np.ones(len(free))), True
+    linearly: Any = True
     for step in range(1, STEPS + 1):  # noqa: B007
         rest, by_value, by_unknown = lines.slopes(values, unknowns)
         away = jnp.stack([unknowns[n] - start[n] for n in names]) if names else jnp.zeros(0)
@@ -123,6 +126,7 @@ def _linearly(run: Bordered, lines: Lines, answer: Response, start: dict[str, An
         x, well = _solved(run, answer)
         if names:
             unknowns = {n: start[n] + run.extra[k] for k, n in enumerate(names)}
+            linearly = _entered_linearly(run, answer, start, unknowns)
         change = sum((answer.held[k] * (unknowns[n] - start[n]) for k, n in enumerate(names)), 0.0)
         values = with_held(disc, answer.nums, x) + change
         rest = lines.missed(values, unknowns)
@@ -130,11 +134,13 @@ def _linearly(run: Bordered, lines: Lines, answer: Response, start: dict[str, An
         good = good & well
         if concrete(met) is None or bool(concrete(met)) or not bool(concrete(jnp.isfinite(rest).all())):
             break
+        if not bool(concrete(linearly)):
+            break
     if not is_traced(values, unknowns, met):
         told = f"the constraints are not met after {step} step(s) of Newton's method; are they possible?"
-        if not (bool(good) and bool(met)) and not run.failed and np.isfinite(values).all():
+        if linearly and not (bool(good) and bool(met)) and not run.failed and np.isfinite(values).all():
             run.fail(told)
-    return unknowns, values, good & met, step
+    return unknowns, values, good & met, linearly, step
 
 
 def _jointly(

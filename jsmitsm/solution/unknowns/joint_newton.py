@@ -41,10 +41,7 @@ from jsmitsm.solution.nonlinear.newton import (
 from jsmitsm.solution.nonlinear.start import start
 from jsmitsm.solution.nonlinear.steps import Iterate, Record, distance, raising, shallow
 from jsmitsm.solution.unknowns.bordered import Bordered
-from jsmitsm.solution.unknowns.lines import Lines
-
-# Part of an unknown, or of one where it is nothing, by which it is moved for a difference.
-MOVED = 1e-5
+from jsmitsm.solution.unknowns.lines import Lines, number
 
 
 class Stepping:
@@ -71,7 +68,7 @@ class Stepping:
         """Slopes at ``here``, for the next steps; by how much the constraints are missed, and the linear system."""
         rest, *by = self.lines.slopes(here.values, self.named(here.unknowns), here.taylor)
         system, *grown = self._by_unknowns(here)
-        self._slopes = *grown, *(_number(v) for v in by)
+        self._slopes = *grown, *(number(v) for v in by)
         return rest, system
 
     def _solved(self, here: Iterate, rest: Any, system: Any) -> Iterate:
@@ -79,7 +76,7 @@ class Stepping:
         grown, moved, by_value, by_unknown = self._slopes
         nums, (data, r, c, b) = system
         base = with_held(run.disc, nums, np.zeros(len(b)))
-        run.columns, run.lines = grown, _number(lines.of_free(by_value))
+        run.columns, run.lines = grown, number(lines.of_free(by_value))
         run.corner = np.zeros((len(rest),) * 2) if run.multipliers else by_unknown + by_value @ moved.T
         run.right = -(rest + by_value @ (base - here.values).reshape(-1))
         run.right = run.right if is_traced(run.right) else np.asarray(run.right)
@@ -104,15 +101,15 @@ class Stepping:
         if run.multipliers:
             return self._system(here.unknowns, here.taylor), run.constants(), np.zeros((0, run.disc.held.size))
         free = np.flatnonzero(~run.disc.held.reshape(-1))
-        u, now = _number(here.values).reshape(-1)[free], _number(here.unknowns)
+        u, now = number(here.values).reshape(-1)[free], number(here.unknowns)
 
         def looked(system: Any) -> tuple[Any, Any]:
             nums, (data, r, c, b) = system
-            held = _number(with_held(run.disc, nums, np.zeros(len(free)))).reshape(-1)
-            return times(_number(data), r, c, u) - _number(b), held
+            held = number(with_held(run.disc, nums, np.zeros(len(free)))).reshape(-1)
+            return times(number(data), r, c, u) - number(b), held
 
         xp: Any = jnp if is_traced(u, now) else np
-        sizes = MOVED * xp.maximum(abs(now), xp.where(self.begin != 0, abs(self.begin), 1.0))
+        sizes = self.lines.moves(self.named(now), linear=False)
         beside = [looked(self._system(now + d * e, here.taylor)) for d, e in zip(sizes, np.eye(len(now)))]
         system = self._system(here.unknowns, here.taylor)  # the last, which the run keeps
         changes = [[(b - a) / d for a, b in zip(looked(system), there)] for d, there in zip(sizes, beside)]
@@ -156,7 +153,7 @@ def joint_newton(run: Bordered, lines: Lines, unknowns: dict[str, Any], u0: Any)
     It begins at u0, or at the solution for the unknowns as they are given.
     """
     begin = jnp.stack([jnp.asarray(unknowns[n], float) for n in lines.names]) if lines.names else np.zeros(0)
-    stepping = Stepping(run, lines, _number(begin))
+    stepping = Stepping(run, lines, number(begin))
     here = Iterate(*_first(run, u0), stepping.begin)
     missed = lines.missed(here.values, stepping.named(here.unknowns), here.taylor)
     if any(concrete(x) is None for x in (*here, missed)):
@@ -249,9 +246,3 @@ def _first(run: Bordered, u0: Any) -> tuple[Any, Any]:
         good = good & jnp.isfinite(values).all() & jnp.isfinite(taylor).all()
         return jnp.where(good, values, here[0]), jnp.where(good, taylor, here[1])
     return values, taylor
-
-
-def _number(x: Any) -> Any:
-    """The numbers behind x, or where there are none x without derivatives."""
-    known = concrete(x)
-    return jax.lax.stop_gradient(x) if known is None else np.asarray(known)

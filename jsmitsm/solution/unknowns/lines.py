@@ -11,12 +11,15 @@ import numpy as np
 
 from jsmitsm.equation.problem import Problem
 from jsmitsm.runtime.errors import IN_FUNCTIONS, in_words
+from jsmitsm.runtime.tracers import concrete, is_traced
 from jsmitsm.solution.fit import Recipe
 from jsmitsm.solution.unknowns.bordered import Bordered, BorderedRegionsRun
 from jsmitsm.solution.unknowns.solution import Probe, RegionsProbe
 
 # A constraint is met when it misses by this part of what it is made of; round-off of the fits leaves 1e-12.
 MET = 1e-9
+# Part of an unknown by which it is moved for a difference where the problem is not linear.
+MOVED = 1e-5
 
 
 class Lines:
@@ -30,19 +33,45 @@ class Lines:
 
     def missed(self, values: Any, unknowns: dict[str, Any], taylor: Any = None) -> Any:
         """By how much the constraints (C,) are missed; taylor: about which a nonlinear problem is linearised."""
-        fit = self.run.fit(unknowns, values, self.recipe, taylor)
-        probe = self.kind(values, self.run.disc.cloud, self.recipe, fit, True, 1, {}, unknowns=unknowns)
-        return jnp.stack([_value(c, probe, k) for k, c in enumerate(self.constraints)])
+        return self._missed(self.run.fit(unknowns, values, self.recipe, taylor), values, unknowns)[0]
+
+    def _missed(self, fit: Any, values: Any, unknowns: dict[str, Any], fitted: Any = None) -> tuple[Any, Any]:
+        """With the local polynomials (N, F, K), None where nothing asks for them."""
+        cloud = self.run.disc.cloud
+        probe = self.kind(values, cloud, self.recipe, fit, True, 1, {}, fitted=fitted, unknowns=unknowns)
+        return jnp.stack([_value(c, probe, k) for k, c in enumerate(self.constraints)]), probe._fitted
 
     def slopes(self, values: Any, unknowns: dict[str, Any], taylor: Any = None) -> tuple[Any, Any, Any]:
-        """What is missed (C,), and its derivatives by the values (C, N F) and by the unknowns (C, K)."""
-        missed: Callable[..., Any] = lambda v, g: self.missed(v, g, taylor)  # noqa: E731
-        rest, pull = jax.vjp(missed, jnp.asarray(values, float), unknowns)
-        slopes = [pull(row) for row in np.eye(len(self.constraints))]
-        by_value = jnp.stack([v.reshape(-1) for v, _ in slopes])
-        none = jnp.zeros((len(slopes), 0))
-        by_unknown = jnp.stack([jnp.stack([g[n] for n in self.names]) for _, g in slopes]) if self.names else none
-        return rest, by_value, by_unknown
+        """What is missed (C,), and its derivatives by the values (C, N F) and by the unknowns (C, K).
+
+        With the polynomials P(v, g) between, c(v, P, g) has the slopes c_v + c_P P_v and c_g + c_P P_g. P_v takes what
+        held particles of a nonlinear problem are linearised at for given, and P_g are differences. So nothing that the
+        equation is made of is differentiated, and the polynomials are linear in g where the problem is.
+        """
+        values = jnp.asarray(values, float)
+        made: Callable[..., Any] = lambda v, g: self.run.fit(g, v, self.recipe, taylor)  # noqa: E731
+        fit = made(values, unknowns)
+        rest, fitted = self._missed(fit, values, unknowns)
+        missed: Callable[..., Any] = lambda v, g, *p: self._missed(fit, v, g, *p)[0]  # noqa: E731
+        _, pull = jax.vjp(missed, values, unknowns, *([] if fitted is None else [fitted]))
+        by_v, by_g, *by_p = zip(*(pull(row) for row in np.eye(len(rest))))
+        by_value, by_unknown = jnp.stack(by_v), [jnp.stack([g[n] for g in by_g]) for n in self.names]
+        if by_p:
+            _, pull = jax.vjp(lambda v: made(v, unknowns).coefficients(v, about=values), values)
+            by_value += jnp.stack([pull(p)[0] for p in by_p[0]])
+            for k, (name, move) in enumerate(zip(self.names, self.moves(unknowns, linear=taylor is None))):
+                there = made(values, {**unknowns, name: unknowns[name] + move}).coefficients(values)
+                grown = (there - fitted) / move
+                by_unknown[k] += jnp.stack([jnp.vdot(p, grown) for p in by_p[0]])
+        none = jnp.zeros((len(rest), 0))
+        return rest, by_value.reshape(len(rest), -1), jnp.stack(by_unknown, axis=1) if by_unknown else none
+
+    def moves(self, unknowns: dict[str, Any], linear: bool) -> list[Any]:
+        """By how much each unknown is moved for a difference: as much as it is or was, or one; a small part of it where
+        something is not linear. Numbers where they are known."""
+        assert self.problem.extras is not None
+        begin = self.problem.extras.unknowns
+        return [_size(unknowns[n], begin[n]) * (1.0 if linear else MOVED) for n in self.names]
 
     def met(self, rest: Any, by_value: Any, by_unknown: Any, values: Any, unknowns: dict[str, Any]) -> Any:
         """Whether what is missed is small beside what it is made of."""
@@ -59,6 +88,18 @@ class Lines:
         place = np.flatnonzero(number >= 0)
         count = int((~disc.held).sum())
         return jnp.zeros((len(by_value), count)).at[:, number[place]].add(by_value[:, place])
+
+
+def number(x: Any) -> Any:
+    """The numbers behind x, or where there are none x without derivatives."""
+    known = concrete(x)
+    return jax.lax.stop_gradient(x) if known is None else np.asarray(known)
+
+
+def _size(now: Any, begin: Any) -> Any:
+    now, begin = number(now), number(begin)
+    xp: Any = jnp if is_traced(now, begin) else np
+    return xp.maximum(abs(now), xp.where(begin != 0, abs(begin), 1.0))
 
 
 def _value(c: Any, probe: Any, k: int) -> Any:

@@ -49,13 +49,11 @@ class ConstrainedRegionsSolution(WithUnknowns, RegionsSolution):
 class Probing(Solution):
     """A solution on its way through a functional: its polynomials are fitted once, traced or not."""
 
-    _made: Any = None
-
     @property
     def _taylor(self) -> Any:
-        if self._made is None:
-            self._made = self._fit.coefficients(self._values)
-        return self._made
+        if self._fitted is None:
+            self._fitted = self._fit.coefficients(self._values)
+        return self._fitted
 
 
 class Probe(Probing, ConstrainedSolution):
