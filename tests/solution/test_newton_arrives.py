@@ -43,13 +43,13 @@ def kink(start, order, n):
 
 
 # Twice the errors of the discretisation; the matrix, whose condition is about 1e7, leaves 2e-8 of round-off.
-@pytest.mark.parametrize("order, ceilings", [(2, (4e-3, 1e-3)), (4, (4e-5, 3e-6)), (6, (6e-7, 1e-7))])
+@pytest.mark.parametrize("order, ceilings", [(2, (1e-3, 4e-3)), (4, (3e-6, 4e-5)), (6, (1e-7, 6e-7))])
 def test_a_kink_is_reached_from_everywhere(order, ceilings):
     """Its place is nearly free: the linearised equation is nearly singular there, and singular on the way.
 
     From the straight line it comes there without depth first, and goes on with it: the steps of both are counted.
     """
-    for n, ceiling in zip((61, 121), ceilings):
+    for n, ceiling in zip((121, 61), ceilings):  # programs for more particles serve fewer too
         for start, most in (
             (None, 36), (lambda x: x[0] / 6, 20), (lambda x: jnp.sign(x[0]), 9), (lambda x: jnp.tanh(x[0] / ROOT), 5)
         ):  # fmt: skip
@@ -241,7 +241,7 @@ def test_arc_length_ends_after_its_steps():
 
 
 def test_arc_length_refuses_what_it_cannot_follow():
-    cloud = js.interval(0.0, 1.0, 9)
+    cloud = js.interval(0.0, 1.0, 21)
     with pytest.raises(ValueError, match="parameters: .*direction"):
         js.continuation(bratu, cloud, [1.0, 1.0], arclength=True)
     with pytest.raises(ValueError, match="steps: .*got 0"):
