@@ -19,6 +19,8 @@ from jsmitsm.solution.solution import Solution
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 MARKERS = "os^Dv<>P"
 GREY = "0.62"
+# Domains so many times as long as high are low: their colour bar lies below them.
+LOW = 2.5
 
 
 def pyplot() -> Any:
@@ -239,7 +241,6 @@ def at_ends(ax: Any, ends: list[tuple[float, float, str, str]]) -> None:
 def maps(cloud: Cloud, numbers: np.ndarray, anywhere: Callable | None, at: Mapping[str, float] | None, levels: int,
          colorbar: bool, given: Any, label: str, log: bool) -> Any:  # fmt: skip
     """Filled contours of a 2D cloud, or of slices through a 3D one, all on one scale."""
-    plt = pyplot()
     from matplotlib.ticker import FuncFormatter, MaxNLocator
 
     if not isinstance(levels, (int, np.integer)) or levels < 0:
@@ -264,14 +265,12 @@ def maps(cloud: Cloud, numbers: np.ndarray, anywhere: Callable | None, at: Mappi
         if many:
             ax.set_title(f"{AXES[axis]} = {position:.4g}", fontsize="medium")
     if colorbar:
-        bar = plt.colorbar(filled, ax=list(drawn), label=label, shrink=0.85)
-        bar.locator = round_ticks()
-        bar.update_ticks()
+        bar = colour_bar(filled, drawn, label)
         if log:
             whole = bool(np.floor(bounds[-1]) - np.ceil(bounds[0]) >= 1)
-            bar.ax.yaxis.set_major_locator(MaxNLocator(6, integer=whole))
+            bar.long_axis.set_major_locator(MaxNLocator(6, integer=whole))
             power = FuncFormatter(lambda k, _: f"$10^{{{k:.0f}}}$" if whole else f"{10**k:.2g}")
-            bar.ax.yaxis.set_major_formatter(power)
+            bar.long_axis.set_major_formatter(power)
     return drawn if many else drawn[0]
 
 
@@ -285,6 +284,16 @@ def steps(values: np.ndarray, levels: int) -> np.ndarray:
     between: Any = MaxNLocator(levels + 1).tick_values(lo, hi)
     slack = 1e-2 * (hi - lo)  # a band that rounding alone makes would promise values that do not occur
     return np.concatenate([[lo], between[(between > lo + slack) & (between < hi - slack)], [hi]])
+
+
+def colour_bar(filled: Any, drawn: Any, label: str) -> Any:
+    """Beside the pictures, or below one that is long and low, where its numbers would collide."""
+    first = drawn[0]
+    low = len(drawn) == 1 and first.dataLim.width > LOW * first.dataLim.height
+    return first.figure.colorbar(
+        filled, ax=list(drawn), label=label, shrink=0.85, ticks=round_ticks(),
+        **({"location": "bottom", "pad": 0.3, "aspect": 30} if low else {}),
+    )  # fmt: skip
 
 
 def round_ticks() -> Any:
@@ -308,9 +317,9 @@ def page(points: np.ndarray) -> tuple[float, float]:
     if points.shape[1] != 2:
         return (5.6, 1.6) if points.shape[1] == 1 else (7.6, 5.0)
     width, height = np.ptp(points, axis=0)
-    ratio = float(np.clip(height / width, 0.4, 2.2)) if width > 0 else 1.0 if height == 0 else 2.2
+    ratio = float(np.clip(height / width, 0.2, 2.2)) if width > 0 else 1.0 if height == 0 else 2.2
     wide = 4.6 if ratio < 1 else 4.6 / ratio
-    return wide + 1.3, wide * ratio + 0.5
+    return wide + 1.3, wide * ratio + (0.5 if ratio > 1 / LOW else 1.6)
 
 
 def places(cloud: Cloud, at: Mapping[str, float] | None) -> list[tuple[int, float]]:

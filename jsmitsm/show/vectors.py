@@ -228,7 +228,7 @@ def deformed(sol: Solution, *, scale: float | None = None, colour: Callable | No
         at = one.places + factor * one.values[:, :2]
         filled = drawing.painted(ax, Piece(at, one.triangles, z, []), bounds, "viridis")
         ax.plot(*_strokes(at[_rim(one.triangles)].transpose(1, 2, 0)), color=_INK, linewidth=0.8)
-    ax.figure.colorbar(filled, ax=ax, label=label, shrink=0.85, ticks=drawing.round_ticks())
+    drawing.colour_bar(filled, [ax], label)
     ax.set_title(title, fontsize="medium")
     drawing.dress(ax, 2)
     return ax

@@ -128,6 +128,16 @@ def test_error_and_estimate_maps(holed, line):
     assert ax.get_yscale() == "log" and abs(top - 0.01) < 1e-10
 
 
+@pytest.mark.parametrize(("height", "below"), [(0.5, True), (1.0, False)])
+def test_the_colour_bar_of_a_long_domain_lies_below_it(height, below):
+    """Beside a low picture its numbers collide."""
+    long = js.rectangle((0.0, 0.0), (2.0, height), (9, 5))
+    ax = plot.values(long, long.points[:, 0])
+    (bar,) = [other for other in ax.figure.axes if other is not ax]
+    assert (bar.get_position().y1 < ax.get_position().y0) == below
+    assert (bar.get_position().x0 > ax.get_position().x1) == (not below)
+
+
 def test_slices_of_a_solid():
     box = js.box((0, 0, 0), (1, 1, 1), (5, 5, 5))
     axes = plot.values(box, box.points.sum(axis=1))
