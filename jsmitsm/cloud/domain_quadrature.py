@@ -1,13 +1,15 @@
-"""Integrals over the domain: Gauss points in the simplices between the particles and in what curved boundaries add.
+"""Integrals over the domain and its boundary: Gauss points in the simplices between the particles and in thin layers.
 
-Between a facet of the outermost simplices and the boundary lies a thin layer. The boundary is the graph, over the plane
-of the facet, of the polynomial through the boundary particles around it; the layer is swept along the particles'
-normals, interpolated, so that neighbouring layers fit together.
+Between a facet of the outermost simplices and a curved boundary lies a thin layer, swept along the particles' normals,
+interpolated, so that neighbouring layers fit together; it ends on the boundary. That is the zero level of the shape
+where the cloud knows it, else the graph, over the plane of the facet, of the polynomial through the boundary particles
+around it.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,6 +20,8 @@ from jsmitsm.taylor.multi_indices import multi_indices
 # A particle's normal counts at a facet if it is within 30 degrees of the facet's own; beyond, there is a corner.
 _SMOOTH = math.cos(math.radians(30.0))
 _STEPS = 8
+# Heights over a facet, in sizes of its surroundings, and differences of normals, that are round-off.
+_FLAT = 1e-9
 
 
 def domain_rule(cloud: Cloud, degree: int) -> tuple[np.ndarray, np.ndarray]:
@@ -32,31 +36,65 @@ def domain_rule(cloud: Cloud, degree: int) -> tuple[np.ndarray, np.ndarray]:
     return tuple(np.concatenate([part[k].reshape(-1, *part[k].shape[2:]) for part in parts]) for k in (0, 1))  # type: ignore
 
 
+class _Swept(NamedTuple):
+    """Ways from Gauss points of facets to the boundary, along the particles' normals, interpolated."""
+
+    base: np.ndarray  # (M, Q, D) on the facets
+    way: np.ndarray  # (M, Q, D)
+    reach: np.ndarray  # (M, Q), how many ways it is to the boundary
+    weights: np.ndarray  # (Q,)
+    sides: np.ndarray  # (M, D - 1, D) of the facets
+    turns: np.ndarray  # (M, D - 1, D), by which the ways change along them
+    handed: np.ndarray  # (M, 1), the sign that makes volumes on the outward side of a facet positive
+    outward: np.ndarray  # (M, Q, D) unit normals where the ways end
+
+    def at(self, share: float) -> tuple[np.ndarray, np.ndarray]:
+        """Where (M, Q, D) a share of the ways is gone, and the volume (M, Q) that a unit of them sweeps there."""
+        along = self.sides[:, None] + (share * self.reach)[..., None, None] * self.turns[:, None]
+        volume = np.linalg.det(np.concatenate([along, self.way[:, :, None]], axis=2)) * self.handed
+        return self.base + (share * self.reach)[..., None] * self.way, volume * self.weights
+
+
+def surface_rule(
+    cloud: Cloud, facets: np.ndarray, normal: np.ndarray, degree: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points (M, Q, D), weights (M, Q) and unit normals (M, Q, D) on the boundary over facets (M, D)."""
+    swept = _swept(cloud, facets, normal, degree)
+    found, volume = swept.at(1.0)
+    # A layer that ends at the surface is as thick as the way's part along the normal.
+    return found, volume / np.einsum("mqd,mqd->mq", swept.way, swept.outward), swept.outward
+
+
 def _layers(cloud: Cloud, degree: int) -> tuple[np.ndarray, np.ndarray]:
     """Points (M, Q, D) and signed weights (M, Q) between the facets and the boundary."""
-    points = np.asarray(cloud.points, float)
     facets, normal = boundary_facets(cloud)
     facets, normal = (x[~lying_on(cloud, facets)] for x in (facets, normal))
     if not len(facets):
         return np.zeros((0, 1, cloud.dim)), np.zeros((0, 1))
-    corners = points[facets]
-    height = _graphs(cloud, corners, facets, normal, degree)
-    flat = np.broadcast_to(normal[:, None], corners.shape)
-    own = normals_of(cloud)[facets]
-    swept = np.where((np.sum(own * flat, axis=2) >= _SMOOTH)[..., None], own, flat)
-    at, weights = _simplex_rule(cloud.dim - 1, degree // 2 + 1)
-    base, way = (np.einsum("qk,mkd->mqd", at, x) for x in (corners, swept))
-    reach = height(base, way)
+    swept = _swept(cloud, facets, normal, degree)
     x, w = np.polynomial.legendre.leggauss(degree // 2 + 1)
     found, measure = [], []
     for share, part in zip((x + 1.0) / 2.0, w / 2.0):
-        found.append(base + (share * reach)[..., None] * way)
-        along = (corners[:, 1:] - corners[:, :1])[:, None] + (share * reach)[..., None, None] * (
-            swept[:, 1:] - swept[:, :1])[:, None]  # fmt: skip
-        frame = np.concatenate([along, way[:, :, None]], axis=2)
-        upright = np.concatenate([corners[:, 1:] - corners[:, :1], normal[:, None]], axis=1)
-        measure.append(part * weights * reach * np.linalg.det(frame) * np.sign(np.linalg.det(upright))[:, None])
+        here, volume = swept.at(share)
+        found.append(here)
+        measure.append(part * swept.reach * volume)
     return np.concatenate(found, axis=1), np.concatenate(measure, axis=1)
+
+
+def _swept(cloud: Cloud, facets: np.ndarray, normal: np.ndarray, degree: int) -> _Swept:
+    """The ways from facets (M, D) with outward normals (M, D) to the boundary."""
+    corners = np.asarray(cloud.points, float)[facets]
+    flat = np.broadcast_to(normal[:, None], corners.shape)
+    own = normals_of(cloud)[facets]
+    ways = np.where((np.sum(own * flat, axis=2) >= _SMOOTH)[..., None], own, flat)
+    at, weights = _simplex_rule(cloud.dim - 1, degree // 2 + 1)
+    base, way = (np.einsum("qk,mkd->mqd", at, x) for x in (corners, ways))
+    # Where the shape is known the graph is the start of the way there only.
+    graph = _graphs(cloud, corners, facets, normal, degree if cloud._shape is None else min(degree, 4))
+    reach, outward = _to_shape(cloud, base, way, normal, *graph(base, way))
+    sides = corners[:, 1:] - corners[:, :1]
+    handed = np.sign(np.linalg.det(np.concatenate([sides, normal[:, None]], axis=1)))
+    return _Swept(base, way, reach, weights, sides, ways[:, 1:] - ways[:, :1], handed[:, None], outward)
 
 
 def _graphs(cloud: Cloud, corners: np.ndarray, facets: np.ndarray, normal: np.ndarray, degree: int):
@@ -70,7 +108,8 @@ def _graphs(cloud: Cloud, corners: np.ndarray, facets: np.ndarray, normal: np.nd
     count = min(len(rim), degree + 2 if dim == 2 else 2 * len(some))
     distance, near = cKDTree(points[rim]).query(middle, k=range(1, count + 1))
     near = rim[near]
-    alike = np.einsum("mkd,md->mk", np.nan_to_num(normals_of(cloud)[near]), normal) > 0.5
+    own = np.nan_to_num(normals_of(cloud)[near])
+    alike = np.einsum("mkd,md->mk", own, normal) > 0.5
     # A facet's own corners are on its side, whatever normal they have.
     alike |= (near[:, :, None] == facets[:, None, :]).any(axis=2)
     size = np.where(alike, distance, 0.0).max(axis=1)
@@ -79,18 +118,51 @@ def _graphs(cloud: Cloud, corners: np.ndarray, facets: np.ndarray, normal: np.nd
     weight = np.where(alike, np.exp(-((1.5 * distance / size[:, None]) ** 2)), 0.0)
     matrix = np.prod(place[:, :, None] ** some, axis=3) * weight[..., None]
     fitted = np.einsum("mak,mk->ma", np.linalg.pinv(matrix, rcond=1e-10), weight * level)
-    fitted[np.abs(weight * level).max(axis=1) < 1e-13] = 0.0
+    # A particle in the facet's plane that looks where the facet does: the side is flat, whatever is round the corner.
+    flat = (np.abs(level) < _FLAT) & (np.abs(own - normal[:, None]).max(axis=2) < _FLAT)
+    fitted[flat.any(axis=1) | (np.abs(weight * level).max(axis=1) < 1e-13)] = 0.0
 
-    def reach(base: np.ndarray, way: np.ndarray) -> np.ndarray:
+    def reach(base: np.ndarray, way: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         t = np.zeros(base.shape[:2])
         for _ in range(_STEPS):
             at = (base + t[..., None] * way - middle[:, None]) / size[:, None, None]
             xi, rise = np.einsum("mqd,mtd->mqt", at, tangents), np.einsum("mqd,md->mq", at, normal)
             miss = rise - np.einsum("mqa,ma->mq", np.prod(xi[:, :, None] ** some, axis=3), fitted)
             t = t - miss * size[:, None] / np.einsum("mqd,md->mq", way, normal)
-        return t
+        unit = np.eye(dim - 1, dtype=int)
+        powers = [b * np.prod(xi[:, :, None] ** np.maximum(some - e, 0), axis=3) for e, b in zip(unit, some.T)]
+        slope = np.einsum("tmqa,ma->mqt", powers, fitted)
+        outward = normal[:, None] - np.einsum("mqt,mtd->mqd", slope, tangents)
+        return t, outward / np.linalg.norm(outward, axis=2, keepdims=True)
 
     return reach
+
+
+def _to_shape(
+    cloud: Cloud, base: np.ndarray, way: np.ndarray, normal: np.ndarray, reach: np.ndarray, outward: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """How far it is to the boundary, and its normals, by the shape where the cloud knows it: the graph came close."""
+    if cloud._shape is None:
+        return reach, outward
+
+    def off(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        distance, direction = cloud._shape.distance((base + t[..., None] * way).reshape(-1, cloud.dim))
+        return distance.reshape(t.shape), direction.reshape(base.shape)
+
+    near = 1e-10 * np.ptp(base, axis=(0, 1)).max()
+    straight = (np.abs(off(np.zeros_like(reach))[0]) < near).all(axis=1, keepdims=True)
+    t = reach
+    for _ in range(_STEPS):
+        miss, own = off(t)
+        steep = np.einsum("mqd,mqd->mq", own, way)
+        if np.abs(miss).max() < 1e-4 * near:
+            break
+        t = t - miss / np.where(steep > 0.1, steep, np.inf)
+    # Where the shape has ridges, or the polynomial went astray, the graph stays.
+    width = np.linalg.norm(np.ptp(base, axis=1), axis=1)[:, None]
+    good = ((np.abs(miss) < near) & (steep > 0.1) & (np.abs(t - reach) < 0.3 * width)).all(axis=1, keepdims=True)
+    t, outward = np.where(good, t, reach), np.where(good[..., None], own, outward)
+    return np.where(straight, 0.0, t), np.where(straight[..., None], normal[:, None], outward)
 
 
 def _simplex_rule(dim: int, count: int) -> tuple[np.ndarray, np.ndarray]:

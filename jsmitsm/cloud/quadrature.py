@@ -1,4 +1,4 @@
-"""Integrals over boundary groups: curved facets between boundary particles, Gauss points on them."""
+"""Integrals over boundary groups and over the domain: Gauss points and what they weigh."""
 
 from __future__ import annotations
 
@@ -8,15 +8,13 @@ from typing import NamedTuple
 import numpy as np
 
 from jsmitsm.cloud.cloud import Cloud
-from jsmitsm.cloud.domain_quadrature import domain_rule
+from jsmitsm.cloud.domain_quadrature import domain_rule, surface_rule
 from jsmitsm.cloud.regions.region_cloud import RegionCloud, sides
-from jsmitsm.cloud.triangulation import boundary_facets, lying_on
+from jsmitsm.cloud.triangulation import boundary_facets
 from jsmitsm.runtime.errors import explaining
-from jsmitsm.taylor.multi_indices import multi_indices
 
-# A particle's normal shapes a facet if it is within 30 degrees of the facet's own; beyond, there is a corner.
+# A particle's normal is like a facet's if it is within 30 degrees of the facet's own; beyond, there is a corner.
 _SMOOTH = math.cos(math.radians(30.0))
-_GAUSS = 4
 # Boundary particles around a facet among which its group is looked for.
 _AROUND = 30
 
@@ -39,14 +37,15 @@ class Quadrature(NamedTuple):
 def quadrature(cloud: Cloud, group: str | None = None, degree: int = 8) -> Quadrature:
     """Points and weights for integrals over a boundary group, or over the domain where no group is named.
 
-    Over the domain: exact for polynomials of the ``degree`` where the boundary is straight, of error
-    O(spacing^(degree + 1)) where it curves smoothly; the normals are NaN.
+    Exact for polynomials of the ``degree`` where the boundary is straight, of error O(spacing^degree) or less where it
+    curves smoothly. The boundary is the zero level of the shape where the cloud knows it; clouds that were made of
+    points, read or unpickled do not, and there it is made of polynomials through the particles, flat where particles
+    and normals say so. In 2D these have the same order; on the surfaces of solids about the fourth has been seen,
+    whatever the degree. Corners that turn by less than 60 degrees between curved sides are then taken for smooth.
 
-    Between neighbouring boundary particles lie cubic facets that follow their normals (curved PN
-    triangles, Vlachos et al. 2001, and their counterpart in 2D), flat at corners and where the
-    cloud has no normals. A facet belongs to the group whose normals it continues. The
-    error is O(spacing^4) on smooth boundaries, none on straight ones. Over the domain of a cloud of several regions
-    the rules of all stand one after another; over an interface ``"a|b"`` the normals point from a to b.
+    A facet belongs to the group whose normals it continues. Over the domain the normals are NaN; over the domain of a
+    cloud of several regions the rules of all stand one after another; over an interface ``"a|b"`` the normals point
+    from a to b.
 
     Parameters
     ----------
@@ -55,7 +54,7 @@ def quadrature(cloud: Cloud, group: str | None = None, degree: int = 8) -> Quadr
     group : str, optional
         The name of a boundary group; the domain if not given.
     degree : int
-        Of the polynomials that are integrated exactly over the domain.
+        Of the polynomials that are integrated exactly.
 
     Returns
     -------
@@ -95,8 +94,8 @@ def quadrature(cloud: Cloud, group: str | None = None, degree: int = 8) -> Quadr
     facets, normal = (x[_members(cloud, facets, normal, group)] for x in (facets, normal))
     if cloud.dim == 1:
         return Quadrature(points[facets[:, 0]], np.ones(len(facets)), normal)
-    net = _control_net(points[facets], _vertex_normals(cloud, facets, normal))
-    return _gauss(net, normal)
+    found = surface_rule(cloud, facets, normal, int(degree))
+    return Quadrature(*(x.reshape(-1, *x.shape[2:]) for x in found))
 
 
 def _of_regions(cloud: RegionCloud, group: str | None, degree: int) -> Quadrature:
@@ -129,65 +128,3 @@ def _members(cloud: Cloud, facets: np.ndarray, normal: np.ndarray, group: str) -
     alike = np.nan_to_num(np.sum(own[near] * normal[:, None], axis=2), nan=-1.0) >= _SMOOTH
     first = np.take_along_axis(near, alike.argmax(axis=1)[:, None], axis=1)[:, 0]
     return np.where(alike.any(axis=1), named[first], mask)
-
-
-def _vertex_normals(cloud: Cloud, facets: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """The particles' normals (M, D, D) where the boundary is smooth, those of the flat facet elsewhere."""
-    flat = np.broadcast_to(normal[:, None], (*facets.shape, cloud.dim))
-    if cloud.normals is None:
-        return flat
-    own = np.asarray(cloud.normals)[facets]
-    smooth = (np.sum(own * flat, axis=2) >= _SMOOTH) & ~lying_on(cloud, facets)[:, None]
-    return np.where(smooth[..., None], own, flat)
-
-
-def _control_net(corners: np.ndarray, normals: np.ndarray) -> dict[tuple[int, ...], np.ndarray]:
-    """Control points of the cubic facets, by the exponents of the barycentric coordinates."""
-    dim = corners.shape[1]
-    net = {}
-    for a in (a for a in multi_indices(dim, 3) if sum(a) == 3):
-        i = int(np.argmax(a))
-        if max(a) == 3:
-            net[a] = corners[:, i]
-        elif max(a) == 2:
-            j = a.index(1)
-            side = corners[:, j] - corners[:, i]
-            rise = np.sum(side * normals[:, i], axis=1, keepdims=True) * normals[:, i]
-            net[a] = corners[:, i] + (side - rise) / 3.0
-    if dim == 3:
-        edge = np.mean([net[a] for a in net if max(a) == 2], axis=0)
-        net[1, 1, 1] = edge + (edge - corners.mean(axis=1)) / 2.0
-    return net
-
-
-def _reference(dim: int) -> tuple[np.ndarray, np.ndarray]:
-    """Gauss points as barycentric coordinates (Q, D) and weights, on a segment or, collapsed, a triangle."""
-    x, w = np.polynomial.legendre.leggauss(_GAUSS)
-    x, w = (x + 1.0) / 2.0, w / 2.0
-    if dim == 2:
-        return np.stack([x, 1.0 - x], axis=1), w
-    s, t = (v.ravel() for v in np.meshgrid(x, x, indexing="ij"))
-    return np.stack([s, (1 - s) * t, (1 - s) * (1 - t)], axis=1), (np.outer(w, w) * (1 - x)[:, None]).ravel()
-
-
-def _gauss(net: dict[tuple[int, ...], np.ndarray], outward: np.ndarray) -> Quadrature:
-    """Points, weights and normals on Bezier facets."""
-    dim = outward.shape[1]
-    at, weights = _reference(dim)
-    points = np.zeros((len(outward), len(at), dim))
-    slopes = np.zeros((dim, len(outward), len(at), dim))
-    for a, control in net.items():
-        factor = 6.0 / math.prod(map(math.factorial, a))
-        points += factor * np.prod(at ** np.array(a), axis=1)[:, None] * control[:, None]
-        for k in range(dim):
-            if a[k]:
-                lower = np.array([v - (k == m) for m, v in enumerate(a)])
-                slopes[k] += factor * a[k] * np.prod(at**lower, axis=1)[:, None] * control[:, None]
-    along = slopes[:-1] - slopes[-1]
-    if dim == 2:
-        normal = np.stack([along[0][..., 1], -along[0][..., 0]], axis=-1)
-    else:
-        normal = np.cross(along[0], along[1])
-    size = np.linalg.norm(normal, axis=-1, keepdims=True)
-    normal = normal / size * np.sign(np.sum(normal * outward[:, None], axis=-1, keepdims=True))
-    return Quadrature(points.reshape(-1, dim), (size[..., 0] * weights).ravel(), normal.reshape(-1, dim))

@@ -190,7 +190,7 @@ class Anywhere(Copied):
     def integral(self, group: str | None = None) -> jax.Array:
         """The integral of u over a boundary group, or without a name over the domain.
 
-        That over the domain has the order of the solution, on curved domains too; see ``js.quadrature``.
+        Of the order of the solution, on curved domains and boundaries too; ``js.quadrature`` says where it is not.
 
         Parameters
         ----------
@@ -222,7 +222,7 @@ class Anywhere(Copied):
 
     @explaining
     def flux(self, group: str, conductivity: ValueOrFunction = 1.0) -> jax.Array:
-        """The integral of conductivity n . grad u over a boundary group, n outward.
+        """The integral of conductivity n . grad u over a boundary group, n outward; of the order of the solution.
 
         Parameters
         ----------
@@ -252,7 +252,7 @@ class Anywhere(Copied):
         6.0
         """
         self.refuse_stacked()
-        points, weights, normals = quadrature(self.cloud, group)
+        points, weights, normals = quadrature(self.cloud, group, self.order)
         if callable(conductivity):
             conductivity = jax.vmap(conductivity)(points)
         elif not is_traced(conductivity) and np.asarray(conductivity).dtype.kind not in "iuf":
