@@ -18,7 +18,7 @@ from jsmitsm.equation.unknowns.extras import refuse_extras
 from jsmitsm.linear.linsolve import Solver
 from jsmitsm.runtime import notebooks
 from jsmitsm.runtime.arrays import ValueOrFunction
-from jsmitsm.runtime.errors import did_you_mean, explaining, is_number, is_whole, short
+from jsmitsm.runtime.errors import did_you_mean, explaining, is_number, is_one_of, is_whole, refuse_word, short
 from jsmitsm.runtime.progress import bar
 from jsmitsm.solution.arguments import Depth, Formulation, Method
 from jsmitsm.solution.solution import Solution
@@ -215,7 +215,7 @@ def _checked(problem, make, tol, order, start, quantity, norm, max_particles, ma
         )
     if not is_number(tol) or not 0.0 < tol < 1.0:
         raise ValueError(f"tol: expected a relative error between 0 and 1, got {short(tol)}")
-    if order != "auto" and not is_whole(order, 1):
+    if not is_one_of(order, ["auto"]) and not is_whole(order, 1):
         raise ValueError(f'order: expected "auto" or a whole number from 1 to {ORDERS[-1]}, got {short(order)}')
     if order != "auto" and order > ORDERS[-1]:
         raise ValueError(
@@ -226,8 +226,7 @@ def _checked(problem, make, tol, order, start, quantity, norm, max_particles, ma
             raise ValueError(f"start: expected a positive spacing or a function (M, D) -> (M,), got {short(start)}")
     if quantity is not None and not callable(quantity):
         raise ValueError(f"quantity: expected a function of a Solution that returns a number, got {short(quantity)}")
-    if norm not in NORMS:
-        raise ValueError(f"norm: {norm!r} is none of {', '.join(map(repr, NORMS))}{did_you_mean(norm, NORMS)}")
+    refuse_word("norm", norm, NORMS)
     for value, name in ((max_particles, "max_particles"), (max_rounds, "max_rounds")):
         if not is_whole(value, 1):
             raise ValueError(f"{name}: expected a whole number from 1, got {short(value)}")

@@ -13,7 +13,7 @@ from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.cloud.regions.region_cloud import RegionCloud
 from jsmitsm.particle.kernels import EDGE
 from jsmitsm.runtime.arrays import Array, ArrayLike
-from jsmitsm.runtime.errors import explaining, short
+from jsmitsm.runtime.errors import explaining, is_whole, short
 from jsmitsm.runtime.interrupts import interruptible
 from jsmitsm.runtime.progress import bar
 from jsmitsm.runtime.threads import cores
@@ -120,7 +120,7 @@ def stencils(cloud: Cloud, *, size: int | None = None, radius: ArrayLike | None 
     points = np.asarray(cloud.points)
     if size is None:
         return within(points, radius)
-    if isinstance(size, bool) or not isinstance(size, (int, np.integer)) or size < 2:
+    if not is_whole(size, 2):
         raise ValueError(f"size: expected a whole number of at least 2 (the particle itself counts), got {short(size)}")
     return nearest(points, int(size))
 

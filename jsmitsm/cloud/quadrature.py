@@ -11,7 +11,7 @@ from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.cloud.domain_quadrature import domain_rule, surface_rule
 from jsmitsm.cloud.regions.region_cloud import RegionCloud, sides
 from jsmitsm.cloud.triangulation import boundary_facets
-from jsmitsm.runtime.errors import explaining
+from jsmitsm.runtime.errors import explaining, is_whole
 
 # A particle's normal is like a facet's if it is within 30 degrees of the facet's own; beyond, there is a corner.
 _SMOOTH = math.cos(math.radians(30.0))
@@ -75,7 +75,7 @@ def quadrature(cloud: Cloud, group: str | None = None, degree: int = 8) -> Quadr
     >>> round(float(js.quadrature(cloud).weights.sum()), 12)
     2.0
     """
-    if isinstance(degree, bool) or not isinstance(degree, (int, np.integer)) or degree < 1:
+    if not is_whole(degree, 1):
         raise ValueError(f"degree: expected a whole number from 1, got {degree!r}")
     if not isinstance(cloud, Cloud):
         raise ValueError(f"cloud: expected a js.Cloud, got {type(cloud).__name__}")

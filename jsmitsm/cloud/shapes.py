@@ -12,7 +12,7 @@ from jsmitsm.cloud.cloud import INTERIOR, Cloud
 from jsmitsm.cloud.filling import SpacingLike
 from jsmitsm.cloud.packing.octree import Region, Spacing
 from jsmitsm.runtime.arrays import ArrayLike
-from jsmitsm.runtime.errors import explaining, short
+from jsmitsm.runtime.errors import explaining, is_whole, short
 from jsmitsm.runtime.progress import bar
 
 # The cosine of 5 degrees: boundary particles whose normals differ by more may stand on two sides of a corner.
@@ -250,7 +250,7 @@ def grouped(points: np.ndarray, groups: Mapping[str, Predicate]) -> dict[str, np
 
 
 def checked_seed(seed: Any) -> int:
-    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
+    if not is_whole(seed, 0):
         raise ValueError(f"seed: expected a whole number >= 0, got {seed!r}")
     return int(seed)
 

@@ -30,7 +30,7 @@ from jsmitsm.particle.elimination import Scheme
 from jsmitsm.particle.kernels import Constant, Kernel
 from jsmitsm.particle.recursion import Recursion, free_indices, recursion
 from jsmitsm.runtime.compiled import at_hand
-from jsmitsm.runtime.errors import IN_FUNCTIONS, in_words
+from jsmitsm.runtime.errors import IN_FUNCTIONS, in_words, is_whole
 from jsmitsm.runtime.tracers import concrete, is_traced, owned
 
 _LARGE = 1 << 22  # bytes of the user's stencils that are quickly compared
@@ -390,7 +390,7 @@ def _scheme(method: str, rec: Recursion, traced: Traced, problem: Problem, cloud
     jac = None if is_traced(jac) else np.asarray(jac)[0, :, 0]
     free, dependent = free_indices(rec, jac)
     if basis_terms is not None:
-        whole = isinstance(basis_terms, (int, np.integer)) and not isinstance(basis_terms, bool)
+        whole = is_whole(basis_terms)
         if not whole or not 1 <= basis_terms <= len(free):
             raise ValueError(
                 f"basis_terms: expected 1 to {len(free)} free coefficients at this order, got {basis_terms!r}"

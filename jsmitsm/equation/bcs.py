@@ -10,7 +10,7 @@ import numpy as np
 
 from jsmitsm.equation.traced import Traced
 from jsmitsm.runtime.arrays import ArrayLike, ValueOrFunction
-from jsmitsm.runtime.errors import explaining, refuse_masked, short
+from jsmitsm.runtime.errors import explaining, is_whole, refuse_masked, short
 from jsmitsm.runtime.tracers import is_traced
 
 
@@ -290,7 +290,7 @@ def free() -> Condition:
 
 
 def _field(field: Any) -> int | None:
-    if field is not None and (isinstance(field, bool) or not isinstance(field, (int, np.integer)) or field < 0):
+    if field is not None and not is_whole(field, 0):
         raise ValueError(f"field: expected the number of a field (0, 1, ...), got {short(field)}")
     return None if field is None else int(field)
 

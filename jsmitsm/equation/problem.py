@@ -15,7 +15,7 @@ from jsmitsm.equation.unknowns.constraint import Constraint
 from jsmitsm.equation.unknowns.extras import Extras, extras
 from jsmitsm.equation.unknowns.point_source import PointSource
 from jsmitsm.runtime import notebooks
-from jsmitsm.runtime.errors import did_you_mean, explaining, short
+from jsmitsm.runtime.errors import did_you_mean, explaining, is_whole, short
 
 
 @jax.tree_util.register_pytree_node_class
@@ -85,7 +85,7 @@ class Problem:
             pde = per_region(pde)
         elif not callable(pde):
             raise ValueError(f"pde: expected a function pde(u, x) returning the residual, got {type(pde).__name__}")
-        if isinstance(fields, bool) or not isinstance(fields, (int, np.integer)) or not 1 <= fields < 1000:
+        if not is_whole(fields, 1, 999):
             raise ValueError(f"fields: expected the number of unknown fields (1, 2, ... 999), got {short(fields)}")
         if not isinstance(bcs, Mapping):
             raise ValueError(

@@ -14,7 +14,7 @@ from jsmitsm.cloud.regions.region_cloud import RegionCloud
 from jsmitsm.discretization.regions.rows import spread_values
 from jsmitsm.equation.problem import Problem
 from jsmitsm.equation.unknowns.extras import refuse_extras
-from jsmitsm.runtime.errors import did_you_mean, is_number, is_whole, refuse_masked, short
+from jsmitsm.runtime.errors import is_number, is_whole, refuse_masked, refuse_no_switch, refuse_word, short
 from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.taylor.multi_indices import HIGHEST
 
@@ -50,14 +50,11 @@ def check(problem, cloud, t, steps, tol, order, scheme, throw, progress) -> None
     if tol is not None:
         if not is_number(tol) or not 1e-13 <= tol <= 0.1:
             raise ValueError(f"tol: expected a number from 1e-13 to 0.1, relative to the solution, got {short(tol)}")
-    if not isinstance(scheme, str) or scheme not in SCHEMES:
-        known = ", ".join(map(repr, SCHEMES))
-        raise ValueError(f"scheme: {scheme!r} is none of {known}{did_you_mean(str(scheme), SCHEMES)}")
+    refuse_word("scheme", scheme, SCHEMES)
     if not is_whole(order, 1, HIGHEST):
         raise ValueError(f"order: expected a whole number from 1 to {HIGHEST}, got {short(order)}")
-    for value, name in ((throw, "throw"), (progress, "progress")):
-        if not isinstance(value, (bool, np.bool_)):
-            raise ValueError(f"{name}: expected True or False, got {short(value)}")
+    refuse_no_switch("throw", throw)
+    refuse_no_switch("progress", progress)
 
 
 def saved_times(save: Any, t0: float, t1: float) -> np.ndarray:

@@ -24,7 +24,7 @@ from jax.interpreters import ad, batching, mlir
 from jsmitsm.linear.factor_cache import Settings, clear_cache, factorisations, lookup
 from jsmitsm.linear.solver_choice import DENSE_MAX, refuse_too_large
 from jsmitsm.linear.sparse import Factor
-from jsmitsm.runtime.errors import SingularMatrix, SolveError
+from jsmitsm.runtime.errors import SingularMatrix, SolveError, is_one_of
 from jsmitsm.runtime.jaxprs import Primitive
 from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.runtime.whole_program import in_one_program
@@ -123,7 +123,7 @@ def solve(
 
 def _check(data: Any, rows: Any, cols: Any, b: Any, n: int, points: Any, solver: str) -> np.ndarray | None:
     """Refuse what does not fit; the points as a numpy array."""
-    if solver not in SOLVERS:
+    if not is_one_of(solver, SOLVERS):
         raise ValueError(f"solver: got {solver!r}, expected one of {', '.join(SOLVERS)}")
     if np.ndim(data) != 1 or np.shape(rows) != np.shape(data) or np.shape(cols) != np.shape(data):
         raise ValueError(

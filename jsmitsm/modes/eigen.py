@@ -20,7 +20,7 @@ from jsmitsm.modes.modes import Modes
 from jsmitsm.modes.question import Question, assembled, operators, reduced
 from jsmitsm.modes.spectrum import in_real_numbers, modes, normalised, pairs
 from jsmitsm.runtime.arrays import ValueOrFunction
-from jsmitsm.runtime.errors import SolveError, explaining, short
+from jsmitsm.runtime.errors import SolveError, explaining, is_one_of, is_whole, short
 from jsmitsm.runtime.progress import PENCIL, bar
 from jsmitsm.runtime.tracers import concrete, is_traced
 from jsmitsm.solution.arguments import Depth, check, of_regions
@@ -176,11 +176,11 @@ def _finished(question: Question, values: Any, right: Any, good: Any, found: Any
 def check_question(problem: Problem, count: Any, near: Any, method: Any) -> None:
     """Arguments that can be judged before any work."""
     refuse_extras(problem)
-    if method != "S":
+    if not is_one_of(method, ["S"]):
         raise ValueError(
-            f"method: {method!r} has no pencil: only the rows of method \"S\" know their source; leave it out"
+            f"method: {short(method)} has no pencil: only the rows of method \"S\" know their source; leave it out"
         )
-    if isinstance(count, (bool, np.bool_)) or not isinstance(count, (int, np.integer)) or count < 1:
+    if not is_whole(count, 1):
         raise ValueError(f"count: expected a whole number of values from 1, got {short(count)}")
     if is_traced(near):
         raise ValueError("near: it is traced by a JAX transform, but says which values are sought; give a number")

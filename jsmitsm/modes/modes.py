@@ -18,7 +18,7 @@ from jsmitsm.modes.question import Question
 from jsmitsm.modes.spectrum import Pairs
 from jsmitsm.runtime import notebooks
 from jsmitsm.runtime.arrays import Array, ArrayLike
-from jsmitsm.runtime.errors import explained, explaining, short, some
+from jsmitsm.runtime.errors import explained, explaining, is_whole, short, some
 from jsmitsm.runtime.tracers import Copied, frozen, is_traced, owned
 from jsmitsm.solution.fit import Fit, Recipe
 from jsmitsm.solution.regions.fit import RegionsFit
@@ -199,7 +199,7 @@ class Modes(Copied):
     def _between(self, k: Any) -> Solution:
         """Mode k with its local polynomials: those of the equation L u - lambda mass u = 0."""
         n = len(self)
-        if isinstance(k, (bool, np.bool_)) or not isinstance(k, (int, np.integer)) or not -n <= k < n:
+        if not is_whole(k, -n, n - 1):
             raise ValueError(f"k: expected the number of a mode, 0 to {n - 1}, got {short(k)}")
         k = int(k) % n
         if k in self._fitted:

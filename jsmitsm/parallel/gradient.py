@@ -20,7 +20,7 @@ from jsmitsm.parallel.distributed import ParallelCloud
 from jsmitsm.parallel.local import Local
 from jsmitsm.parallel.shares import local_kernel, local_problem
 from jsmitsm.parallel.solving import solve
-from jsmitsm.runtime.errors import explaining
+from jsmitsm.runtime.errors import explaining, is_one_of
 
 WRT = ("params", "points")
 
@@ -66,7 +66,7 @@ def value_and_grad(
     --------
     ``value, slope = jp.value_and_grad(lambda u, x, k: (u**2).sum(), problem, cloud, order=4)``
     """
-    if wrt not in WRT or (wrt == "params" and getattr(problem, "params", None) is None):
+    if not is_one_of(wrt, WRT) or (wrt == "params" and getattr(problem, "params", None) is None):
         raise ValueError(f"wrt: {wrt!r} is none of {', '.join(map(repr, WRT))}, or the problem has no params")
     sol = solve(problem, cloud, **options)
     us, local = sol._team, sol._local

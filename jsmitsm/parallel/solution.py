@@ -12,7 +12,7 @@ from jsmitsm.parallel.look.flags import kinks, told
 from jsmitsm.parallel.look.towards import corrected
 from jsmitsm.parallel.team import Team, team
 from jsmitsm.runtime.arrays import ArrayLike
-from jsmitsm.runtime.errors import SolveError, explained, explaining
+from jsmitsm.runtime.errors import SolveError, explained, explaining, is_one_of
 from jsmitsm.runtime.tracers import frozen
 from jsmitsm.solution.evaluation import checked_points
 from jsmitsm.solution.fit import Recipe
@@ -145,7 +145,7 @@ def norm(values: ArrayLike, kind: str = "max") -> float:
     us = team()
     own = np.abs(np.asarray(values))
     with us.phase():
-        if kind not in ("max", "rms"):
+        if not is_one_of(kind, ("max", "rms")):
             raise ValueError(f"kind: {kind!r} is none of 'max', 'rms'")
     if kind == "max":
         return float(np.max(us.gather(float(own.max(initial=0.0)))))

@@ -20,7 +20,7 @@ from jsmitsm.parallel.system import SOLVERS, ways
 from jsmitsm.parallel.team import Team, team
 from jsmitsm.particle.kernels import Kernel
 from jsmitsm.runtime.arrays import ValueOrFunction
-from jsmitsm.runtime.errors import did_you_mean, explaining
+from jsmitsm.runtime.errors import did_you_mean, explaining, is_one_of
 from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.solution.arguments import Depth, check
 from jsmitsm.solution.fit import Recipe
@@ -140,7 +140,7 @@ def refuse_others(problem: Any, cloud: Any, method: Any, form: Any, solver: Any)
     refuse_traced(problem.params, getattr(cloud, "points", None))
     for value, known, name in ((method, ("S", "III"), "method"), (form, ("auto", "loo"), "formulation"),
                                (solver, SOLVERS, "solver")):  # fmt: skip
-        if value not in known:
+        if not is_one_of(value, known):
             raise ValueError(f"{name}: {value!r} is none of {', '.join(map(repr, known))}, which are made for several "
                              f"processes{did_you_mean(value, known)}")  # fmt: skip
     ways(solver, True)

@@ -211,6 +211,40 @@ def did_you_mean(name: Any, known: Iterable[str]) -> str:
     return f"; did you mean {lower[close[0]]!r}?" if close else ""
 
 
+def is_one_of(value: Any, known: Iterable[str]) -> bool:
+    """Whether a value is one of these words; an array, which compares by its entries, is none.
+
+    >>> import numpy as np
+    >>> is_one_of("loo", ["loo", "lsq"]), is_one_of(np.zeros(2), ["loo", "lsq"])
+    (True, False)
+    """
+    return isinstance(value, str) and value in known
+
+
+def refuse_word(name: str, value: Any, known: Iterable[str]) -> None:
+    """Refuse what is none of these words.
+
+    >>> refuse_word("norm", "maks", ["max", "rms"])
+    Traceback (most recent call last):
+      ...
+    ValueError: norm: 'maks' is none of 'max', 'rms'; did you mean 'max'?
+    """
+    if not is_one_of(value, known):
+        raise ValueError(f"{name}: {short(value)} is none of {', '.join(map(repr, known))}{did_you_mean(value, known)}")
+
+
+def refuse_no_switch(name: str, value: Any) -> None:
+    """Refuse what is neither True nor False: of "no" and of arrays Python would say that they are true, or nothing.
+
+    >>> refuse_no_switch("log", "no")
+    Traceback (most recent call last):
+      ...
+    ValueError: log: expected True or False, got 'no'
+    """
+    if not isinstance(value, (bool, np.bool_)):
+        raise ValueError(f"{name}: expected True or False, got {short(value)}")
+
+
 def short(value: Any) -> str:
     """A value as a message quotes it, a traced one in words.
 
@@ -276,9 +310,12 @@ def numbers(name: str, value: Any) -> np.ndarray:
     ValueError: parameters: expected numbers, got 'ab'
     """
     try:
-        return np.asarray(value, float)
+        # Dates, texts and None would become floats.
+        if np.asarray(value).dtype.kind in "biufO" and value is not None:
+            return np.asarray(value, float)
     except (TypeError, ValueError, OverflowError):
-        raise ValueError(f"{name}: expected numbers, got {short(value)}") from None
+        pass
+    raise ValueError(f"{name}: expected numbers, got {short(value)}")
 
 
 def listed(name: str, value: Any, expected: str) -> list[Any]:
@@ -296,11 +333,13 @@ def listed(name: str, value: Any, expected: str) -> list[Any]:
 
 
 def is_whole(value: Any, least: float = -np.inf, most: float = np.inf) -> bool:
-    """Whether a value is a whole number of this range; True and False are none."""
-    return isinstance(value, (int, np.integer)) and not isinstance(value, bool) and bool(least <= value <= most)
+    """Whether a value is a whole number of this range; True, False and a span of time are none."""
+    whole = isinstance(value, (int, np.integer)) and not isinstance(value, (bool, np.timedelta64))
+    return whole and bool(least <= value <= most)
 
 
 def is_number(value: Any) -> bool:
-    """Whether a value is a finite real number; True and False are none."""
-    real = isinstance(value, (int, float, np.number)) and not isinstance(value, (bool, np.complexfloating))
+    """Whether a value is a finite real number; True, False and a span of time are none."""
+    no_number = (bool, np.complexfloating, np.timedelta64)
+    real = isinstance(value, (int, float, np.number)) and not isinstance(value, no_number)
     return real and bool(np.isfinite(value))

@@ -24,6 +24,8 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import Any
 
+from jsmitsm.runtime.errors import refuse_no_switch
+
 # Seconds before a bar appears: what is done by then needs none. Then between two ticks of its clock,
 # and the shortest time between two movements.
 DELAY, TICK, PAUSE = 1.5, 0.5, 0.1
@@ -214,6 +216,7 @@ def bar(what: str, total: int | None = None, wanted: bool = True, parts: Parts =
     It has ``update(n)``, ``note(text)`` and, with ``parts``, ``reach(part of the whole)``. Also a decorator:
     ``@bar("what the function does")``. parts: the stages to come, by which the rest of the call is estimated.
     """
+    refuse_no_switch("progress", wanted)
     outer = _shown.get()
     if not wanted or (outer is None and not watched()):
         made: Any = _NOTHING

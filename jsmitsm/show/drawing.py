@@ -11,6 +11,7 @@ import numpy as np
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.cloud.neighbours import Stencils, within
 from jsmitsm.particle.kernels import Kernel
+from jsmitsm.runtime.errors import is_number, is_whole, short
 from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.show.pieces import AXES, Piece, clipped, pieces
 from jsmitsm.solution.solution import Solution
@@ -119,11 +120,11 @@ def gapped(pieces: np.ndarray) -> np.ndarray:
 def field_of(numbers: Any, field: int) -> np.ndarray:
     """One field (N,) of values (N,) or (N, F)."""
     array = real("numbers", numbers)
-    if array.ndim < 2:
-        return array
-    if not isinstance(field, (int, np.integer)) or not 0 <= field < array.shape[1]:
-        raise ValueError(f"field: {field!r}, but the solution has fields 0 to {array.shape[1] - 1}")
-    return array[:, field]
+    fields = 1 if array.ndim < 2 else array.shape[1]
+    if not is_whole(field, 0, fields - 1):
+        has = "the one field 0" if fields == 1 else f"fields 0 to {fields - 1}"
+        raise ValueError(f"field: {short(field)}, but the solution has {has}")
+    return array if array.ndim < 2 else array[:, field]
 
 
 def name_of(sol: Solution, field: int, label: str | None = None) -> str:
@@ -133,6 +134,8 @@ def name_of(sol: Solution, field: int, label: str | None = None) -> str:
 
 def at_points(function: Callable, points: np.ndarray) -> np.ndarray:
     """A function of one point, written in jax.numpy or in numpy, at all of them."""
+    if not callable(function):
+        raise ValueError(f"exact: expected a function of one point x, got {short(function)}")
     try:
         return np.asarray(jax.vmap(function)(points), dtype=float)
     except jax.errors.JAXTypeError:
@@ -187,7 +190,7 @@ def draw_normals(ax: Any, cloud: Cloud, place: np.ndarray) -> None:
 def draw_support(ax: Any, cloud: Cloud, place: np.ndarray, particle: int, kernel: Any, found: Any,
                  size: float) -> None:  # fmt: skip
     """One particle, its neighbours ringed, and the ball of its kernel; ``size`` is that of the dots."""
-    if not isinstance(particle, (int, np.integer)) or not 0 <= particle < len(cloud):
+    if not is_whole(particle, 0, len(cloud) - 1):
         raise ValueError(f"support: particle {particle!r}, but the cloud has particles 0 to {len(cloud) - 1}")
     if kernel is None and found is None:
         raise ValueError("support: pass kernel=..., stencils=... or a Solution in place of the cloud")
@@ -243,7 +246,7 @@ def maps(cloud: Cloud, numbers: np.ndarray, anywhere: Callable | None, at: Mappi
     """Filled contours of a 2D cloud, or of slices through a 3D one, all on one scale."""
     from matplotlib.ticker import FuncFormatter, MaxNLocator
 
-    if not isinstance(levels, (int, np.integer)) or levels < 0:
+    if not is_whole(levels, 0):
         raise ValueError(f"levels: expected a number of contour levels, such as 20, got {levels!r}")
     if not np.isfinite(numbers).all():
         raise ValueError("sol: has values that are not finite, and did not converge; see sol.diagnose()")
@@ -336,6 +339,6 @@ def places(cloud: Cloud, at: Mapping[str, float] | None) -> list[tuple[int, floa
     if not isinstance(at, Mapping) or not at or set(at) - set(AXES):
         raise ValueError(f'at: {at!r} is not a dict of positions by axis, such as {{"x": 0.5, "z": 0.2}}')
     for name, position in at.items():
-        if not isinstance(position, (int, float, np.number)):
+        if not is_number(position):
             raise ValueError(f"at: expected a number for {name!r}, got {position!r}")
     return [(AXES.index(name), float(position)) for name, position in at.items()]

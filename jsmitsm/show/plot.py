@@ -18,7 +18,7 @@ from jsmitsm.cloud.neighbours import Stencils
 from jsmitsm.cloud.regions.region_cloud import RegionCloud
 from jsmitsm.cloud.triangulation import simplices
 from jsmitsm.particle.kernels import Kernel
-from jsmitsm.runtime.errors import explaining
+from jsmitsm.runtime.errors import explaining, refuse_no_switch, short
 from jsmitsm.show import drawing
 from jsmitsm.show.drawing import COLOURS, GREY, MARKERS
 from jsmitsm.show.histories import adaptation, convergence, sparsity, tuning
@@ -71,6 +71,9 @@ def cloud(what: Cloud | Solution, *, normals: bool = False, support: int | None 
     shown: Cloud = what.cloud if isinstance(what, Solution) else what
     if not isinstance(shown, Cloud):
         raise ValueError(f"what: expected a js.Cloud or a js.Solution, got {type(what).__name__}")
+    refuse_no_switch("normals", normals)
+    if kernel is not None and not isinstance(kernel, Kernel):
+        raise ValueError(f"kernel: expected a kernel such as js.SuperGaussian(h, d), got {short(kernel)}")
     ax = drawing.axes(ax, shown.dim, drawing.page(np.asarray(shown.points)))
     place = drawing.padded(np.asarray(shown.points), shown.dim)
     size = np.clip(6000.0 / len(shown), 3 if shown.dim < 3 else 8, 40)
@@ -273,6 +276,7 @@ def values(cloud: Cloud, numbers: Any, *, log: bool = False, label: str = "", at
     """
     if not isinstance(cloud, Cloud):
         raise ValueError(f"cloud: expected a js.Cloud, got {type(cloud).__name__}")
+    refuse_no_switch("log", log)
     numbers = drawing.real("numbers", numbers)
     if numbers.shape != (len(cloud),):
         raise ValueError(f"numbers: expected shape ({len(cloud)},), one per particle, got {numbers.shape}")
@@ -326,7 +330,8 @@ def error(sol: Solution, exact: Any, *, field: int = 0, log: bool = True, ax: An
     """
     _of(sol).refuse_stacked()
     truth = drawing.at_points(exact, np.asarray(sol.cloud.points)) if callable(exact) else exact
-    truth = drawing.field_of(drawing.real("exact", truth), field)
+    truth = drawing.real("exact", truth)
+    truth = truth if truth.ndim < 2 else drawing.field_of(truth, field)
     if truth.shape != (len(sol.cloud),):
         raise ValueError(f"exact: expected {len(sol.cloud)} numbers, one per particle, got shape {truth.shape}")
     numbers = np.abs(drawing.field_of(sol.u, field) - truth)

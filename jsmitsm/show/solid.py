@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from jsmitsm.cloud.triangulation import boundary_facets
-from jsmitsm.runtime.errors import explaining
+from jsmitsm.runtime.errors import explaining, is_one_of
 from jsmitsm.show import drawing
 from jsmitsm.show.pieces import pieces
 from jsmitsm.solution.solution import Solution
@@ -94,7 +94,7 @@ def stage(engine: str, ax: Any = None) -> Any:
 
 def _pyvista(engine: str) -> Any:
     """pyvista, or None where it is not asked for or not there."""
-    if engine not in _ENGINES:
+    if not is_one_of(engine, _ENGINES):
         raise ValueError(f"engine: expected one of {', '.join(map(repr, _ENGINES))}, got {engine!r}")
     if engine == "matplotlib":
         return None

@@ -11,7 +11,7 @@ import numpy as np
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.cloud.regions.region_cloud import RegionCloud
 from jsmitsm.cloud.triangulation import boundary_facets
-from jsmitsm.runtime.errors import explaining
+from jsmitsm.runtime.errors import explaining, is_whole
 from jsmitsm.show import drawing
 from jsmitsm.show.drawing import COLOURS
 from jsmitsm.show.pieces import Piece, clipped, outline, pieces
@@ -313,7 +313,7 @@ def _space(sol: Any, name: str) -> int:
 
 def _grid(cloud: Cloud, count: int) -> tuple[np.ndarray, list[np.ndarray]]:
     """Points (M, D) of a lattice over the domain's box, ``count`` along its longest side, and the lattice's axes."""
-    if not isinstance(count, (int, np.integer)) or count < 2:
+    if not is_whole(count, 2):
         raise ValueError(f"count: expected a number from 2, got {count!r}")
     points = np.asarray(cloud.points, float)
     lo, hi = points.min(axis=0), points.max(axis=0)

@@ -12,7 +12,7 @@ import numpy as np
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.cloud.quadrature import quadrature
 from jsmitsm.runtime.arrays import ArrayLike, ValueOrFunction
-from jsmitsm.runtime.errors import explaining
+from jsmitsm.runtime.errors import explaining, is_whole, refuse_no_switch
 from jsmitsm.runtime.tracers import Copied, frozen, is_traced
 from jsmitsm.solution.evaluation import checked_points, evaluated, in_domain, nearest_particles
 from jsmitsm.solution.fit import Recipe
@@ -171,13 +171,14 @@ class Anywhere(Copied):
         """
         self.refuse_stacked()
         points = checked_points(points, self.cloud.dim)
-        whole = isinstance(multi_index, (tuple, list)) and all(isinstance(v, (int, np.integer)) for v in multi_index)
+        whole = isinstance(multi_index, (tuple, list)) and all(is_whole(v) for v in multi_index)
         b = tuple(map(int, multi_index)) if whole else ()
         if len(b) != self.cloud.dim or min(b) < 0 or sum(b) > self.order:
             raise ValueError(
                 f"multi_index: expected {self.cloud.dim} non-negative orders with a sum of at most {self.order}, "
                 f"got {multi_index!r}"
             )
+        refuse_no_switch("blend", blend)
         near, weight, first = nearest_particles(self.cloud, points, self.cloud.dim + 2 if blend else 1)
         inside = in_domain(self.cloud, points, outside, first)
         values = evaluated(b, self._recipe.reach, self.cloud.points, self._taylor, points, near, weight)

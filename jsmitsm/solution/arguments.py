@@ -16,7 +16,7 @@ from jsmitsm.equation.regions.interface import INTERFACE
 from jsmitsm.equation.regions.per_region import PerRegion
 from jsmitsm.linear.linsolve import SOLVERS, Solver
 from jsmitsm.particle.kernels import Kernel
-from jsmitsm.runtime.errors import did_you_mean, is_number, is_whole, refuse_masked, short
+from jsmitsm.runtime.errors import is_number, is_whole, refuse_masked, refuse_no_switch, refuse_word, short
 from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.taylor.multi_indices import HIGHEST
 
@@ -93,14 +93,12 @@ def check(
     for value, known, name in (
         (method, METHODS, "method"), (formulation, FORMULATIONS, "formulation"), (solver, SOLVERS, "solver")
     ):  # fmt: skip
-        if value not in known:
-            raise ValueError(f"{name}: {value!r} is none of {', '.join(map(repr, known))}{did_you_mean(value, known)}")
+        refuse_word(name, value, known)
     if formulation == "lsq" and method != "S":
         raise ValueError(f'formulation: "lsq" is a form of method S, not of {method!r}; use method="S" or "loo"')
     if stencils is not None and any(c.kind == "periodic" for cs in problem.bcs.values() for c in cs):
         raise ValueError("stencils: those of a cloud do not reach periodic images; leave stencils out")
-    if not isinstance(throw, (bool, np.bool_)):
-        raise ValueError(f"throw: expected True or False, got {short(throw)}")
+    refuse_no_switch("throw", throw)
     if isinstance(u0, Mapping):
         _check_starts(u0, cloud, problem.fields)
     else:
@@ -116,7 +114,7 @@ def _check_depth(depth: Any, method: str, order: Any) -> None:
     """Degrees beyond the order: "auto" or a whole number."""
     if isinstance(depth, str) and depth == "auto":
         return
-    if isinstance(depth, (bool, np.bool_)) or not isinstance(depth, (int, np.integer)) or depth < 0:
+    if not is_whole(depth, 0):
         raise ValueError(f'depth: expected "auto" or a whole number from 0, degrees beyond the order, got {depth!r}')
     if depth and method == "SSPH":
         raise ValueError(f"depth: SSPH has no recursion to take {depth} degrees further; use depth=0, or method=\"S\"")
@@ -130,7 +128,7 @@ def _check_depth(depth: Any, method: str, order: Any) -> None:
 def _check_starts(u0: Mapping[str, Any], cloud: Any, fields: int) -> None:
     """A start for each region, a number too."""
     regions = getattr(cloud, "regions", {})
-    if set(u0) != set(regions):
+    if set(u0) != set(regions) or not regions:
         raise ValueError(f"u0: starts for the regions {list(u0)}; the cloud has {list(regions) or 'none'}")
     for name, given in u0.items():
         here = (len(regions[name]), fields)

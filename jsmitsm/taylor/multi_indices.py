@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from jsmitsm.runtime.errors import short
+from jsmitsm.runtime.errors import is_whole, short
 
 MultiIndex = tuple[int, ...]
 Slot = tuple[int, MultiIndex]
@@ -47,7 +47,7 @@ def multi_indices(dim: int, degree: int) -> tuple[MultiIndex, ...]:
     ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
     """
     for name, value in (("dim", dim), ("degree", degree)):
-        if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
+        if not is_whole(value):
             raise ValueError(f"{name}: expected a whole number, got {short(value)} (docs: choosing)")
     if not 1 <= dim <= 99:
         raise ValueError(f"dim: expected a number of axes, 1 to 99, got {short(dim)} (docs: choosing)")

@@ -20,7 +20,7 @@ from jsmitsm.equation.problem import Problem
 from jsmitsm.particle.kernels import Kernel
 from jsmitsm.runtime import notebooks
 from jsmitsm.runtime.arrays import ArrayLike, ValueOrFunction
-from jsmitsm.runtime.errors import did_you_mean, explaining, is_whole
+from jsmitsm.runtime.errors import did_you_mean, explaining, is_one_of, is_whole, short
 from jsmitsm.runtime.progress import bar
 from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.solution.arguments import SolveOptions, check, discretized
@@ -219,8 +219,8 @@ def _check_input(problem, cloud, kernel, objective, optimizer, steps, options) -
           depth=o.get("depth", "auto"))
     if is_traced(kernel, cloud, problem.params):
         raise ValueError("kernel, cloud, problem: traced by a JAX transform; js.tune runs on the host, call it outside")
-    if objective != "estimate" and not callable(objective):
-        raise ValueError(f'objective: expected "estimate" or a function of a Solution, got {objective!r}'
+    if not is_one_of(objective, ["estimate"]) and not callable(objective):
+        raise ValueError(f'objective: expected "estimate" or a function of a Solution, got {short(objective)}'
                          + did_you_mean(objective, ["estimate"]))  # fmt: skip
     if optimizer is not None and not (hasattr(optimizer, "init") and hasattr(optimizer, "update")):
         raise ValueError(f"optimizer: expected an optax transformation such as optax.adam(0.1), got {optimizer!r}")

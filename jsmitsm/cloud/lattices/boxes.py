@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from jsmitsm.cloud.cloud import INTERIOR, Cloud
-from jsmitsm.runtime.errors import explaining, short
+from jsmitsm.cloud.cloud import FAR, INTERIOR, Cloud
+from jsmitsm.runtime.errors import explaining, is_number, is_whole, numbers, short
 
 _SIDES = (("left", 0, 0), ("right", 0, 1), ("bottom", 1, 0), ("top", 1, 1), ("front", 2, 0), ("back", 2, 1))
 
@@ -93,9 +93,9 @@ def lattice(lo, hi, shape, jitter, seed, dim=1, names=("lo", "hi", "shape")) -> 
     counts = np.atleast_1d(np.asarray(shape))
     if counts.shape != (dim,) or counts.dtype.kind not in "iu" or (counts < 2).any():
         raise ValueError(f"{names[2]}: expected {dim} whole number(s) of at least 2, got {shape!r}")
-    if not isinstance(jitter, (int, float, np.number)) or not 0.0 <= jitter < 0.5:
+    if not is_number(jitter) or not 0.0 <= jitter < 0.5:
         raise ValueError(f"jitter: expected 0 <= jitter < 0.5 spacings (beyond, particles may meet), got {jitter!r}")
-    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
+    if not is_whole(seed, 0):
         raise ValueError(f"seed: expected a whole number from 0, the start of the random numbers, got {seed!r}")
     axes = [np.linspace(a, b, n) for a, b, n in zip(lo, hi, counts)]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, dim)
@@ -118,9 +118,13 @@ def lattice(lo, hi, shape, jitter, seed, dim=1, names=("lo", "hi", "shape")) -> 
 
 def _checked_corner(value: Any, name: str, dim: int) -> np.ndarray:
     try:
-        corner = np.atleast_1d(np.asarray(value, dtype=np.float64))
-    except (TypeError, ValueError, OverflowError):
+        corner = np.atleast_1d(numbers(name, value))
+    except ValueError:
         raise ValueError(f"{name}: expected {dim} finite number(s), got {short(value)}") from None
+    if np.abs(corner).max(initial=0.0) > FAR and np.isfinite(corner).all():
+        raise ValueError(
+            f"{name}: {short(value)} is of a size whose powers leave the range of floats; use another unit of length"
+        )
     if corner.shape != (dim,) or not np.isfinite(corner).all():
         raise ValueError(f"{name}: expected {dim} finite number(s), got {short(value)}")
     return corner

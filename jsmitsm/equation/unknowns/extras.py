@@ -85,7 +85,7 @@ def extras(
 
 def _is_complex(dtype: Any) -> bool:
     try:
-        kind = np.dtype(dtype).kind
+        kind = np.dtype(dtype).kind if isinstance(dtype, (type, np.dtype, str)) else ""  # a number has a dtype too
     except TypeError:
         kind = ""
     if kind not in "fc" or not kind:

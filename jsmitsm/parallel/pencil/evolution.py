@@ -18,7 +18,7 @@ from jsmitsm.parallel.pencil.space import OwnSystem
 from jsmitsm.parallel.solving import refuse_others, refuse_traced
 from jsmitsm.parallel.team import team
 from jsmitsm.runtime.arrays import ValueOrFunction
-from jsmitsm.runtime.errors import SolveError, did_you_mean, explained, explaining
+from jsmitsm.runtime.errors import SolveError, did_you_mean, explained, explaining, is_one_of
 from jsmitsm.runtime.progress import bar
 
 # Schemes that are made for several processes.
@@ -104,7 +104,7 @@ def evolve(
     """
     us, began = team(), time.perf_counter()
     with us.phase():
-        if scheme not in SCHEMES:
+        if not is_one_of(scheme, SCHEMES):
             raise ValueError(f"scheme: {scheme!r} is none of {', '.join(map(repr, SCHEMES))}, which are made for "
                              f"several processes{did_you_mean(scheme, SCHEMES)}")  # fmt: skip
         refuse_others(problem, cloud, "S", "auto", solver)

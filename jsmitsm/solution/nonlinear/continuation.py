@@ -11,7 +11,7 @@ from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.equation.problem import Problem
 from jsmitsm.particle.kernels import Kernel
 from jsmitsm.runtime.arrays import Array, ValueOrFunction
-from jsmitsm.runtime.errors import SolveError, explaining, is_whole, numbers
+from jsmitsm.runtime.errors import SolveError, explaining, is_whole, numbers, refuse_no_switch
 from jsmitsm.runtime.progress import bar
 from jsmitsm.solution.arguments import SolveOptions
 from jsmitsm.solution.nonlinear.branch import Branch, follow
@@ -113,6 +113,7 @@ def continuation(
         raise ValueError(
             f"problem: expected a function of the parameter that returns a js.Problem, got {type(problem).__name__}"
         )
+    refuse_no_switch("arclength", arclength)
     options["throw"] = True
     if arclength:
         if values[0] == values[1]:
