@@ -108,6 +108,13 @@ CLOUDS = [
     ("interval-reversed", lambda: js.interval(1.0, 0.0, 5), "b:", "greater than a"),
     ("interval-empty", lambda: js.interval(1.0, 1.0, 5), "b:", "greater than a"),
     ("interval-nan", lambda: js.interval(NAN, 1.0, 5), "a:", "finite"),
+    ("interval-date", lambda: js.interval(np.datetime64("2020-01-01"), 1.0, 5), "a:", "finite number"),
+    ("interval-span", lambda: js.interval(0.0, np.timedelta64(1), 5), "b:", "finite number"),
+    ("interval-span-n", lambda: js.interval(0.0, 1.0, np.timedelta64(5)), "n:", "whole number"),
+    ("interval-huge", lambda: js.interval(0.0, 1e300, 5), "^b:", "unit of length"),
+    ("box-huge", lambda: js.box((0, -1e200, 0), (1, 1, 1), (3, 3, 3)), "^lo:", "unit of length"),
+    ("polygon-text", lambda: js.from_polygon([("0", "0"), ("1", "0"), ("0", "1")], 0.2), "vertices", "array of shape"),
+    ("circle-date", lambda: js.sdf.circle((0, 0), np.datetime64("2020-01-01")), "radius:", "expected"),
     ("interval-text", lambda: js.interval("a", 1.0, 5), "a:", "finite number"),
     ("interval-one-particle", lambda: js.interval(0.0, 1.0, 1), "n:", "at least 2"),
     ("interval-float-n", lambda: js.interval(0.0, 1.0, 5.0), "n:", "whole number"),
@@ -185,6 +192,7 @@ STENCILS = [
 ]
 
 PROBLEMS = [
+    ("dtype-number", lambda: js.Problem(poisson, ENDS, dtype=np.float32(0.3)), "dtype:", "float or complex"),
     ("pde-None", lambda: js.Problem(None, ENDS), "pde:", "function"),
     ("pde-number", lambda: js.Problem(1.0, ENDS), "pde:", "function"),
     ("bcs-None", lambda: js.Problem(poisson, None), "bcs:", "dict"),
@@ -335,6 +343,11 @@ SOLVE = [
     ("u0-nan", solve(u0=np.full(9, NAN)), "u0:", "finite"),
     ("u0-complex", solve(u0=1j * np.ones(9)), "u0:", "array|function"),
     ("u0-text", solve(u0="zero"), "u0:", "array|function"),
+    *((f"{name}-array", solve(**{name: np.zeros((2, 2))}), f"{name}:", "is none of") for name in
+      ("method", "formulation", "solver")),
+    ("u0-empty-dict", solve(u0={}), "u0:", "regions"),
+    ("u0-text", solve(u0=["1"] * 9), "u0:", "function of x"),
+    ("depth-span", solve(depth=np.timedelta64(2)), "depth:", "whole number"),
     ("throw-text", solve(throw="no"), "throw:", "True or False"),
     ("method-I-for-a-system", solve(
         pde=lambda u, x: js.laplacian(u)(x), fields=2, method="I"), "method:", 'method="S"'),
@@ -400,6 +413,10 @@ RESIDUALS = [
 FLOW = js.Solution(np.zeros((25, 1)), SQUARE, Recipe("S", 2, None, "auto", 1), None, True, 1, {},
                    fitted=np.zeros((25, 1, 6)))  # fmt: skip
 EVALUATION = [
+    ("blend-text", evaluate(lambda sol: sol([[0.5]], blend="no")), "blend:", "True or False"),
+    ("picture-field", evaluate(lambda sol: js.plot.solution(sol, field=1)), "field:", "one field 0"),
+    ("picture-exact", evaluate(lambda sol: js.plot.solution(sol, exact=3.0)), "exact:", "function of one point"),
+    ("picture-log", lambda: js.plot.values(LINE, np.ones(9), log="no"), "log:", "True or False"),
     ("flat", evaluate(lambda s: s(np.zeros(3))), "points:", r"\(M, 1\)"),
     ("scalar", evaluate(lambda s: s(0.5)), "points:", r"\(M, 1\)"),
     ("dimension", evaluate(lambda s: s(np.zeros((3, 2)))), "points:", r"\(M, 1\)"),

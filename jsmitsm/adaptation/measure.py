@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jsmitsm.runtime.errors import SolveError
+from jsmitsm.runtime.errors import SolveError, in_words
 from jsmitsm.solution.estimate import Correction
 from jsmitsm.solution.solution import Solution
 from jsmitsm.taylor.multi_indices import multi_indices
@@ -144,7 +144,13 @@ def _weights(sol: Solution, quantity: Quantity) -> tuple[float, np.ndarray | Non
         made, slope = jax.value_and_grad(number)(values)
         return float(made), np.asarray(slope)
     except (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError, TypeError):
+        pass  # it is not written in jax.numpy, or fails
+    try:
         return float(np.asarray(quantity(sol)).sum()), None
+    except TypeError as error:
+        raise ValueError(
+            f"quantity: fails ({in_words(error)}); expected a function of a Solution that returns a number"
+        ) from error
 
 
 def spent(history: dict[str, np.ndarray], tol: float) -> float:

@@ -15,7 +15,7 @@ import numpy as np
 from jsmitsm.cloud.packing.lattice import lattice
 from jsmitsm.cloud.packing.octree import Region, Spacing, morton, refine
 from jsmitsm.cloud.packing.relaxation import DENSITY, settled
-from jsmitsm.runtime.errors import IN_FUNCTIONS, short
+from jsmitsm.runtime.errors import IN_FUNCTIONS, numbers, short
 
 SpacingLike = float | Callable[[np.ndarray], Any]
 
@@ -49,7 +49,7 @@ def spacing_function(spacing: Any) -> Spacing:
                 "expected one of points (M, D) that returns lengths (M,)"
             ) from error
         try:
-            h = np.asarray(given, dtype=np.float64)
+            h = numbers("spacing", given)
         except (TypeError, ValueError, OverflowError):
             raise ValueError(f"spacing: the function returned {short(given)}, expected numbers (M,)") from None
         if h.shape != (len(x),):

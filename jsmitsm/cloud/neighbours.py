@@ -13,7 +13,7 @@ from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.cloud.regions.region_cloud import RegionCloud
 from jsmitsm.particle.kernels import EDGE
 from jsmitsm.runtime.arrays import Array, ArrayLike
-from jsmitsm.runtime.errors import explaining, is_whole, short
+from jsmitsm.runtime.errors import explaining, is_whole, numbers, short
 from jsmitsm.runtime.interrupts import interruptible
 from jsmitsm.runtime.progress import bar
 from jsmitsm.runtime.threads import cores
@@ -329,7 +329,7 @@ def within(points: np.ndarray, radius: Any, which: np.ndarray | None = None) -> 
     """All particles within ``radius``, of all particles or of those in ``which``."""
     centres = points if which is None else points[which]
     try:
-        radius = np.asarray(radius, dtype=np.float64)
+        radius = numbers("radius", radius)
     except (TypeError, ValueError, OverflowError):
         came = short(radius)
         raise ValueError(f"radius: expected a positive scalar or ({len(centres)},) array, got {came}") from None

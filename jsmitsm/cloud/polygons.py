@@ -15,7 +15,7 @@ from jsmitsm.cloud import filling, levelset
 from jsmitsm.cloud.lattices.path import followed
 from jsmitsm.cloud.packing import relaxation
 from jsmitsm.cloud.packing.octree import Spacing
-from jsmitsm.runtime.errors import listed
+from jsmitsm.runtime.errors import listed, numbers
 
 _SHARP = np.deg2rad(20.0)  # a vertex that turns by more is a corner of the shape, not a sample of a curve
 
@@ -32,7 +32,7 @@ def checked_holes(holes: Any) -> list[Any]:
 def checked_loop(name: str, vertices: Any) -> np.ndarray:
     """Vertices (V, 2) of a polygon, counter-clockwise, not closed."""
     try:
-        loop = np.asarray(vertices, dtype=np.float64)
+        loop = numbers(name, vertices)
     except (TypeError, ValueError, OverflowError):
         loop = np.zeros(0)
     if loop.ndim != 2 or loop.shape[1] != 2:

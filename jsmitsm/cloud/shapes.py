@@ -12,7 +12,7 @@ from jsmitsm.cloud.cloud import INTERIOR, Cloud
 from jsmitsm.cloud.filling import SpacingLike
 from jsmitsm.cloud.packing.octree import Region, Spacing
 from jsmitsm.runtime.arrays import ArrayLike
-from jsmitsm.runtime.errors import explaining, is_whole, short
+from jsmitsm.runtime.errors import explaining, is_whole, numbers, short
 from jsmitsm.runtime.progress import bar
 
 # The cosine of 5 degrees: boundary particles whose normals differ by more may stand on two sides of a corner.
@@ -258,7 +258,7 @@ def checked_seed(seed: Any) -> int:
 def checked_bounds(bounds: Any) -> tuple[np.ndarray, np.ndarray]:
     """The corners of the box as two float arrays (D,)."""
     try:
-        lo, hi = (np.atleast_1d(np.asarray(corner, dtype=np.float64)) for corner in bounds)
+        lo, hi = (np.atleast_1d(numbers("bounds", corner)) for corner in bounds)
         good = lo.shape == hi.shape and lo.ndim == 1 and len(lo) in (1, 2, 3)
     except (TypeError, ValueError, OverflowError):
         good = False

@@ -14,7 +14,7 @@ from jsmitsm.cloud.regions.region_cloud import RegionCloud
 from jsmitsm.discretization.regions.rows import spread_values
 from jsmitsm.equation.problem import Problem
 from jsmitsm.equation.unknowns.extras import refuse_extras
-from jsmitsm.runtime.errors import is_number, is_whole, refuse_masked, refuse_no_switch, refuse_word, short
+from jsmitsm.runtime.errors import is_number, is_whole, numbers, refuse_masked, refuse_no_switch, refuse_word, short
 from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.taylor.multi_indices import HIGHEST
 
@@ -62,11 +62,11 @@ def saved_times(save: Any, t0: float, t1: float) -> np.ndarray:
     if save is None:
         return np.array([0.0, 1.0])
     if is_whole(save):
-        if save < 1:
-            raise ValueError(f"save: expected at least 1 interval, or an array of times, got {save}")
+        if not 1 <= save <= MOST_STEPS:
+            raise ValueError(f"save: expected 1 to {MOST_STEPS:,} intervals, or an array of times, got {short(save)}")
         return np.linspace(0.0, 1.0, int(save) + 1)
     try:
-        times = np.asarray(save, float)
+        times = numbers("save", save)
     except (TypeError, ValueError, OverflowError):
         raise ValueError(f"save: expected a number of intervals or an array of times, got {short(save)}") from None
     if times.ndim != 1 or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
@@ -106,7 +106,7 @@ def _values(given: Any, cloud: Cloud, fields: int, name: str) -> Any:
     else:
         refuse_masked(given, name)
         try:
-            values = given if is_traced(given) else np.array(given, float)
+            values = given if is_traced(given) else np.array(numbers(name, given))
         except (TypeError, ValueError, OverflowError):
             raise ValueError(f"{name}: expected a function of x, a number or an array, got {short(given)}") from None
         if np.ndim(values) == 0 or (fields > 1 and np.shape(values) == (fields,)):

@@ -184,7 +184,7 @@ def check_question(problem: Problem, count: Any, near: Any, method: Any) -> None
         raise ValueError(f"count: expected a whole number of values from 1, got {short(count)}")
     if is_traced(near):
         raise ValueError("near: it is traced by a JAX transform, but says which values are sought; give a number")
-    if isinstance(near, (bool, str)) or np.ndim(near) or np.iscomplexobj(near) or not _finite(near):
+    if isinstance(near, (bool, str, np.timedelta64)) or np.ndim(near) or np.iscomplexobj(near) or not _finite(near):
         raise ValueError(f"near: expected a finite real number, got {short(near)}")
 
 

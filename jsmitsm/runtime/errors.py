@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import functools
+import math
 import re
 import sys
 from collections.abc import Callable, Iterable, Sequence
@@ -206,8 +207,9 @@ def did_you_mean(name: Any, known: Iterable[str]) -> str:
     >>> did_you_mean("lefft", ["left", "right"]), did_you_mean("Left", ["left"]), did_you_mean("far", ["left", "right"])
     ("; did you mean 'left'?", "; did you mean 'left'?", '')
     """
-    lower = {k.lower(): k for k in known if k != name}
-    close = difflib.get_close_matches(str(name).lower(), lower, 1)
+    came = str(name)  # an array would compare by its entries
+    lower = {k.lower(): k for k in known if k != came}
+    close = difflib.get_close_matches(came.lower(), lower, 1)
     return f"; did you mean {lower[close[0]]!r}?" if close else ""
 
 
@@ -224,10 +226,10 @@ def is_one_of(value: Any, known: Iterable[str]) -> bool:
 def refuse_word(name: str, value: Any, known: Iterable[str]) -> None:
     """Refuse what is none of these words.
 
-    >>> refuse_word("norm", "maks", ["max", "rms"])
+    >>> refuse_word("norm", "mx", ["max", "rms"])
     Traceback (most recent call last):
       ...
-    ValueError: norm: 'maks' is none of 'max', 'rms'; did you mean 'max'?
+    ValueError: norm: 'mx' is none of 'max', 'rms'; did you mean 'max'?
     """
     if not is_one_of(value, known):
         raise ValueError(f"{name}: {short(value)} is none of {', '.join(map(repr, known))}{did_you_mean(value, known)}")
@@ -342,4 +344,7 @@ def is_number(value: Any) -> bool:
     """Whether a value is a finite real number; True, False and a span of time are none."""
     no_number = (bool, np.complexfloating, np.timedelta64)
     real = isinstance(value, (int, float, np.number)) and not isinstance(value, no_number)
-    return real and bool(np.isfinite(value))
+    try:
+        return real and math.isfinite(value)
+    except OverflowError:  # a whole number beyond all floats
+        return False

@@ -16,7 +16,7 @@ from jsmitsm.equation.regions.interface import INTERFACE
 from jsmitsm.equation.regions.per_region import PerRegion
 from jsmitsm.linear.linsolve import SOLVERS, Solver
 from jsmitsm.particle.kernels import Kernel
-from jsmitsm.runtime.errors import is_number, is_whole, refuse_masked, refuse_no_switch, refuse_word, short
+from jsmitsm.runtime.errors import is_number, is_whole, numbers, refuse_masked, refuse_no_switch, refuse_word, short
 from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.taylor.multi_indices import HIGHEST
 
@@ -143,7 +143,7 @@ def _check_start(u0: Any, shape: tuple[int, int], name: str = "u0") -> None:
     try:
         if np.iscomplexobj(u0):
             raise TypeError
-        values = np.asarray(u0, float)
+        values = numbers(name, u0)
     except (TypeError, ValueError, OverflowError):
         raise ValueError(f"{name}: expected a function of x or an array, got {short(u0)}") from None
     if values.shape not in (shape, shape[:1]):

@@ -10,7 +10,7 @@ import numpy as np
 
 from jsmitsm.cloud import contour, levelset, polygons, surface
 from jsmitsm.cloud.packing.octree import Spacing
-from jsmitsm.runtime.errors import short
+from jsmitsm.runtime.errors import numbers, short
 
 
 class Shape(Protocol):
@@ -121,7 +121,7 @@ def shape_of(name: str, given: Any, bounds: Any, spacing: Spacing) -> Shape:
     if hasattr(given, "geom_type"):
         return Polygons(where, _shapely_loops(where, given), spacing)
     try:
-        array = np.asarray(given, float)
+        array = numbers(where, given)
     except (TypeError, ValueError, OverflowError):
         array = np.zeros((0, 0, 0))
     if array.shape == (2,) and np.isfinite(array).all() and array[0] < array[1]:

@@ -8,6 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jsmitsm.runtime.errors import numbers
+
 
 def offset_from(x: jax.Array, origin: Any) -> jax.Array:
     """x - origin; a point of another dimension would be broadcast to a shape that nobody meant."""
@@ -43,7 +45,7 @@ def vector(name: str, value: Any, dim: int | None = None) -> Any:
             if any(isinstance(v, jax.core.Tracer) for v in value):
                 array = jnp.stack([jnp.asarray(v) for v in value])
             else:
-                array = np.asarray(value, dtype=np.float64)
+                array = numbers(name, value)
         except (TypeError, ValueError, OverflowError):
             raise ValueError(f"{name}: expected {dim or 'D'} numbers, got {value!r} (docs: clouds)") from None
     if array.ndim != 1 or (dim is not None and array.shape != (dim,)) or array.shape[0] not in (1, 2, 3):
@@ -59,7 +61,7 @@ def floats(name: str, value: Any) -> Any:
     if isinstance(value, jax.core.Tracer):
         return value
     try:
-        return np.asarray(value, dtype=np.float64)
+        return numbers(name, value)
     except (TypeError, ValueError, OverflowError):
         raise ValueError(f"{name}: expected numbers, got {value!r} (docs: clouds)") from None
 

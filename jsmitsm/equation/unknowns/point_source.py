@@ -26,7 +26,7 @@ import numpy as np
 
 from jsmitsm.equation.unknowns.constraint import checked_number
 from jsmitsm.runtime.arrays import ArrayLike
-from jsmitsm.runtime.errors import explaining, refuse_masked, short
+from jsmitsm.runtime.errors import explaining, numbers, refuse_masked, short
 from jsmitsm.runtime.tracers import is_traced
 
 # Terms of the series, and the largest root(|m|) r for which they are enough and do not cancel beyond 1e-11.
@@ -91,7 +91,7 @@ def point_source(x0: ArrayLike, strength: ArrayLike = 1.0) -> PointSource:
     else:
         refuse_masked(x0, "x0")
         try:
-            place = np.asarray(x0, float)
+            place = numbers("x0", x0)
         except (TypeError, ValueError, OverflowError):
             raise ValueError(f"x0: expected one point (D,), got {short(x0)}") from None
         if not np.isfinite(place).all():
