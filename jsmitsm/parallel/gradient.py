@@ -14,15 +14,19 @@ from jsmitsm.cloud.neighbours import Stencils
 from jsmitsm.discretization.coefficients import numbers
 from jsmitsm.discretization.layout import discretize, table
 from jsmitsm.discretization.leave_one_out import matrix, right_side, with_held
-from jsmitsm.discretization.rows import all_rows
+from jsmitsm.discretization.rows import all_coefficients, all_rows
 from jsmitsm.equation.problem import Problem
+from jsmitsm.parallel.assembly import assembled
 from jsmitsm.parallel.distributed import ParallelCloud
 from jsmitsm.parallel.local import Local
 from jsmitsm.parallel.shares import local_kernel, local_problem
 from jsmitsm.parallel.solving import solve
-from jsmitsm.runtime.errors import explaining, is_one_of
+from jsmitsm.parallel.team import Team
+from jsmitsm.runtime.errors import SolveError, explaining, is_one_of
 
 WRT = ("params", "points")
+# The adjoint of Newton's steps is repeated until it changes by so little, and at most so often.
+SETTLED, MOST = 1e-11, 40
 
 
 @explaining
@@ -33,7 +37,8 @@ def value_and_grad(
     """A number that hangs on the solution, and its gradient by ``problem.params`` or by the particles.
 
     Exact derivatives of the discrete solution at fixed neighbours, as those that JAX takes of ``js.solve``. They cost
-    one more solve, with the transpose, and one more pass over the rows.
+    one more solve, with the transpose, and one more pass over the rows; of a nonlinear problem some more such solves,
+    and the expansions at which it is linearised follow the solution.
 
     Parameters
     ----------
@@ -41,7 +46,7 @@ def value_and_grad(
         ``objective(u, x)``, or ``objective(u, x, params)`` where the problem has params: of the values (n,) or (n, F)
         and the places (n, D) of this process's particles its part of the number. The parts add up.
     problem : Problem
-        Linear.
+        As for ``jp.solve``.
     cloud : Cloud or ParallelCloud
         As for ``jp.solve``.
     wrt : {"params", "points"}
@@ -60,7 +65,7 @@ def value_and_grad(
     ValueError
         As ``jp.solve``; and for ``wrt="params"`` of a problem without any.
     SolveError
-        As ``jp.solve``.
+        As ``jp.solve``; and where a step of Newton's method at the solution does not contract.
 
     Examples
     --------
@@ -69,52 +74,84 @@ def value_and_grad(
     if not is_one_of(wrt, WRT) or (wrt == "params" and getattr(problem, "params", None) is None):
         raise ValueError(f"wrt: {wrt!r} is none of {', '.join(map(repr, WRT))}, or the problem has no params")
     sol = solve(problem, cloud, **options)
-    us, local = sol._team, sol._local
-    halo, disc = local.halo, local.disc
-    given = () if problem.params is None else (problem.params,)
+    us, local, taylor = sol._team, sol._local, sol._linearised
+    halo = local.halo
+    # Newton's last step was linearised at the iterate before.
+    system = sol.system if taylor is None else assembled(us, local, options.get("solver", "auto"), lambda: taylor)[0]
     with us.phase():
-        if not disc.linear:
-            raise ValueError(
-                "problem: gradients of nonlinear problems are not made for several processes; use js.solve"
-            )
-        x = sol._values[~disc.held]
-        part = lambda u: jnp.asarray(objective(u, jnp.asarray(sol.points), *given))  # noqa: E731
-        value, slope = jax.value_and_grad(part)(jnp.asarray(sol.u))
-        free = ~disc.held[halo.ids]
-        slope = np.asarray(slope).reshape(free.shape)[free]
-    weights = sol.system.solve(slope, transpose=True)
+        given = problem.params if wrt == "params" else jnp.asarray(local.cloud.points)
+        (value, away, fitted), back = jax.vjp(_step(objective, problem, local, wrt), given, taylor, sol._values)
+        more = () if problem.params is None else (problem.params,)
+        slope = jax.grad(lambda u: jnp.asarray(objective(u, jnp.asarray(sol.points), *more)))(jnp.asarray(sol.u))
+        slope, free = np.asarray(slope).reshape(len(halo.ids), -1), ~local.disc.held[halo.ids]
+    asks, silent, nowhere = jnp.ones_like(value), jnp.zeros_like(value), jnp.zeros_like(away)
+
+    def of_others(which: int, *asked: Any) -> Any:
+        """What the own results, asked so much, pull at the own particles' expansions (1) or values (2)."""
+        with us.phase():
+            found = np.asarray(back(asked)[which])
+        return halo.returned(found)[halo.ids]
+
+    def adjoint(pulled: Any) -> Any:
+        """The adjoint of the own unknowns, at which the objective looks, and what is fitted to them, by ``pulled``."""
+        looked = slope if pulled is None else slope + of_others(2, silent, nowhere, pulled)
+        return jnp.asarray(system.solve(looked[free], transpose=True))
+
+    pulled = None
+    if taylor is not None:
+        once_more = lambda pulled: jnp.asarray(of_others(1, silent, adjoint(pulled), pulled))  # noqa: E731
+        pulled = _settled(us, once_more, jnp.zeros_like(fitted))
+    weights = adjoint(pulled)
     with us.phase():
-        points = jnp.asarray(local.cloud.points)
-        lagrangian = _lagrangian(objective, problem, local, x, weights, local.owned)
-        which = 0 if wrt == "params" else 1
-        found = jax.tree.map(np.asarray, jax.grad(lagrangian, argnums=which)(problem.params, points))
+        found = jax.tree.map(np.asarray, back((asks, weights, pulled))[0])
     total = float(us.total(float(value)))
     if wrt == "points":
         return total, halo.returned(found)[halo.ids]
     return total, jax.tree.map(us.total, found)
 
 
-def _lagrangian(objective: Any, problem: Problem, local: Local, x: Any, weights: Any, own: np.ndarray) -> Any:
-    """The own part of the objective and of weights . (b - A x), at fixed unknowns x, by params and points."""
-    halo, settings, near = local.halo, local.settings, Stencils(table(local.disc), None)
+def _settled(us: Team, once_more: Callable[[Any], Any], pulled: Any) -> Any:
+    """What the solution pulls at the expansions: the fixed point of Newton's steps backwards, which contract alike."""
+    for _ in range(MOST):
+        new = once_more(pulled)
+        length, size = (us.most(float(jnp.abs(x).max(initial=0.0))) for x in (new - pulled, new))
+        pulled = new
+        if length <= SETTLED * size:
+            return pulled
+    raise SolveError(
+        f"Newton's steps backwards still change the gradient by {length / size:.1e} of its size after {MOST} of them: "
+        "the cloud does not resolve the solution, take a finer one or another order"
+    )
 
-    def lagrangian(params: Any, points: Any) -> Any:
+
+def _step(objective: Any, problem: Problem, local: Local, wrt: str) -> Callable[..., Any]:
+    """One step from expansions (n, F, K) and values (n, F) of local particles, what it is differentiated by first.
+
+    It gives the own part of the objective, what the own equations linearised at the expansions leave of the values,
+    b - A x, and the own expansions that belong to these; for linear problems no expansions.
+    """
+    halo, settings, own = local.halo, local.settings, local.owned
+    near, place = Stencils(table(local.disc), None), np.full(len(own), -1)
+    place[own] = np.arange(int(own.sum()))
+
+    def step(given: Any, taylor: Any, values: Any) -> tuple[Any, Any, Any]:
+        params, points = (given, local.cloud.points) if wrt == "params" else (problem.params, given)
         changed = problem if problem.params is None else problem.replace(params=params)
         kernel = settings.kernel and local_kernel(settings.kernel, halo.slab)
         disc = discretize(
             local_problem(changed, halo.slab), local.cloud.replace(points=points), settings.method, settings.order,
             kernel, near, None, sources=False, depth=local.disc.rec.depth, part=local.part,
         )  # fmt: skip
-        nums = numbers(disc, disc.problem)
+        nums = numbers(disc, disc.problem, taylor)
         classes, rows = all_rows(disc, nums)
         data, r, c = matrix(disc, classes, rows)
-        b = right_side(disc, nums, classes, rows)
-        mine, row = np.asarray(own)[r], np.full(len(own), -1)
-        row[own] = np.arange(int(own.sum()))
-        away = jnp.dot(weights, b) - jnp.sum(weights[row[r[mine]]] * jnp.asarray(data)[mine] * x[c[mine]])
-        values = jnp.asarray(with_held(disc, nums, x))[halo.ids]
-        values = values[:, 0] if problem.fields == 1 else values
-        given = () if problem.params is None else (params,)
-        return objective(values, points[halo.ids], *given) + away
+        b, x = right_side(disc, nums, classes, rows), values[~local.disc.held]
+        mine = own[r]
+        away = b.at[place[r[mine]]].add(-jnp.asarray(data)[mine] * x[c[mine]])
+        everywhere = jnp.asarray(with_held(disc, nums, x))
+        found = everywhere[halo.ids, 0] if problem.fields == 1 else everywhere[halo.ids]
+        told = objective(found, points[halo.ids], *(() if problem.params is None else (params,)))
+        fitted = None if taylor is None else all_coefficients(disc, nums, everywhere)[halo.ids]
+        return jnp.asarray(told), away, fitted
 
-    return lagrangian
+    return step

@@ -153,5 +153,5 @@ def refuse_traced(*given: Any) -> None:
     if is_traced(given):
         raise ValueError(
             "problem: traced by a JAX transform, which cannot follow several processes; jp.value_and_grad has "
-            "gradients of steady linear problems, js.solve and js.evolve those of all others"
+            "gradients of steady problems, js.evolve those in time"
         )

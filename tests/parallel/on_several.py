@@ -65,10 +65,10 @@ def system():
 
 def quasilinear():
     """A conductivity that depends on u, and a side that radiates."""
-    sides = {name: js.dirichlet(lambda x: x[0] * x[1]) for name in SIDES[:3]}
-    sides["top"] = js.condition(lambda u, x, n: n @ js.grad(u)(x) + u(x) ** 3 - 1.0)
-    pde = lambda u, x: js.divergence(lambda y: (1 + u(y) ** 2) * js.grad(u)(y))(x) + 1.0 + x[0]  # noqa: E731
-    return js.Problem(pde, sides), small()
+    sides = {name: js.dirichlet(lambda x, k: x[0] * x[1]) for name in SIDES[:3]}
+    sides["top"] = js.condition(lambda u, x, n, k: n @ js.grad(u)(x) + k * u(x) ** 3 - 1.0)
+    pde = lambda u, x, k: js.divergence(lambda y: (1 + k * u(y) ** 2) * js.grad(u)(y))(x) + 1.0 + x[0]  # noqa: E731
+    return js.Problem(pde, sides, params=jnp.array(1.0)), small()
 
 
 def heated(source, level):
@@ -178,8 +178,11 @@ def _graded():
 
 
 def _quasilinear():
-    one = js.solve(*quasilinear(), **CHEAP)
-    return {"u": one.u, "steps": one.iterations}
+    problem, cloud = quasilinear()
+    one = js.solve(problem, cloud, **CHEAP)
+    at = lambda k: float((js.solve(problem.replace(params=jnp.array(k)), cloud, **CHEAP).u ** 2).sum())  # noqa: E731
+    slope = (8.0 * (at(1.0 + STEP) - at(1.0 - STEP)) - at(1.0 + 2 * STEP) + at(1.0 - 2 * STEP)) / (12.0 * STEP)
+    return {"u": one.u, "steps": one.iterations, "slope": slope}
 
 
 def _of_params():
@@ -190,7 +193,7 @@ def _of_params():
         params = problem.params | {name: problem.params[name] + step}
         return float((js.solve(problem.replace(params=params), cloud, **CHEAP).u ** 2).sum())
 
-    def slope(name, h=5e-4):
+    def slope(name, h=STEP):
         return (8.0 * (total(name, h) - total(name, -h)) - total(name, 2 * h) + total(name, -2 * h)) / (12.0 * h)
 
     near = js.stencils(cloud, size=9).__class__(js.solve(problem, cloud, **CHEAP)._fit.neighbours, None)
@@ -217,6 +220,7 @@ def _drum():
 
 
 MOVED = ((66, 0), (78, 1))
+STEP = 5e-4  # of differences
 ALONE = {
     "mixed": _mixed, "plain": _plain, "narrow": _narrow, "graded": _graded, "quasilinear": _quasilinear,
     "params": _of_params,
@@ -358,7 +362,10 @@ def once(found, one):
     for ids, part in zip(COMM.allgather(numbers), COMM.allgather(moved)):
         whole[ids] = part
     found["by points"] = max(abs(whole[at] - m) for at, m in zip(MOVED, one["params"]["moved"]))
-    sol = jp.solve(*quasilinear(), **CHEAP)
+    problem, cloud = quasilinear()
+    _, slope = jp.value_and_grad(lambda u, x, k: (u**2).sum(), problem, cloud, **CHEAP)
+    found["nonlinear gradient"] = abs(float(slope) / float(one["quasilinear"]["slope"]) - 1.0)
+    sol = jp.solve(problem, cloud, **CHEAP)
     found["newton"] = off(sol, one["quasilinear"])
     found["steps"] = [sol.iterations, int(one["quasilinear"]["steps"])]
     ready = jp.factorize(heated(0.0, 0.0), cloud, **CHEAP)
