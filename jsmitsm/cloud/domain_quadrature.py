@@ -87,7 +87,8 @@ def _swept(cloud: Cloud, facets: np.ndarray, normal: np.ndarray, degree: int) ->
     flat = np.broadcast_to(normal[:, None], corners.shape)
     own = normals_of(cloud)[facets]
     ways = np.where((np.sum(own * flat, axis=2) >= _SMOOTH)[..., None], own, flat)
-    at, weights = _simplex_rule(cloud.dim - 1, degree // 2 + 1)
+    # An even number: the middle of a side is as near to one particle as to the other, whose polynomials differ there.
+    at, weights = _simplex_rule(cloud.dim - 1, 2 * (degree // 4 + 1))
     base, way = (np.einsum("qk,mkd->mqd", at, x) for x in (corners, ways))
     # Where the shape is known the graph is the start of the way there only.
     graph = _graphs(cloud, corners, facets, normal, degree if cloud._shape is None else min(degree, 4))
