@@ -42,7 +42,7 @@ def test_gradients_and_jit():
         given = [js.constraint(lambda sol: sol.flux("right"), charge)]
         pde = lambda u, x, k, g: k * js.laplacian(u)(x) - 1.0
         problem = js.Problem(pde, ends, params=k, unknowns={"V": 0.3}, constraints=given)
-        return js.solve(problem, ROD, order=2, depth=0)
+        return js.solve(problem, ROD, order=2)
 
     def potential(k, charge):
         sol = rod(k, charge)
