@@ -154,7 +154,8 @@ def test_domain_quadrature_on_curved_domains():
             points, weights, _ = js.quadrature(cloud, degree=degree)
             errors.append(abs(np.sum(weights * CURVED(points)) / exact - 1))
         rate = np.log(errors[0] / errors[1]) / (0.5 * np.log(len(clouds[1]) / len(clouds[0])))
-        assert rate > degree - 0.5 and errors[1] < 2e-5, (degree, errors)
+        rounding = errors[0] < 2e-15  # on the coarser cloud too, at degree 8
+        assert (rate > degree - 0.5 or rounding) and errors[1] < 2e-5, (degree, errors)
 
 
 @pytest.mark.parametrize("cloud, exact", [
