@@ -104,7 +104,7 @@ print(sorted(set(sys.modules) - before))
 """
     read = ast.literal_eval(in_a_fresh_process(code))
     own = [name for name in read if name.startswith("jsmitsm")]
-    of_all = len([path for path in PACKAGE.rglob("*.py")])
+    of_all = len(list(PACKAGE.rglob("*.py")))
     assert len(own) < of_all / 3, f"{len(own)} of {of_all} modules: {own}"
     assert len(read) - len(own) < 20, [name for name in read if name not in own]
 

@@ -18,7 +18,7 @@ from jsmitsm.cloud.triangulation import boundary_facets, lying_on, normals_of, s
 from jsmitsm.taylor.multi_indices import multi_indices
 
 # A particle's normal counts at a facet if it is within 30 degrees of the facet's own; beyond, there is a corner.
-_SMOOTH = math.cos(math.radians(30.0))
+SMOOTH = math.cos(math.radians(30.0))
 _STEPS = 8
 # Heights over a facet, in sizes of its surroundings, and differences of normals, that are round-off.
 _FLAT = 1e-9
@@ -86,7 +86,7 @@ def _swept(cloud: Cloud, facets: np.ndarray, normal: np.ndarray, degree: int) ->
     corners = np.asarray(cloud.points, float)[facets]
     flat = np.broadcast_to(normal[:, None], corners.shape)
     own = normals_of(cloud)[facets]
-    ways = np.where((np.sum(own * flat, axis=2) >= _SMOOTH)[..., None], own, flat)
+    ways = np.where((np.sum(own * flat, axis=2) >= SMOOTH)[..., None], own, flat)
     # An even number: the middle of a side is as near to one particle as to the other, whose polynomials differ there.
     at, weights = _simplex_rule(cloud.dim - 1, 2 * (degree // 4 + 1))
     base, way = (np.einsum("qk,mkd->mqd", at, x) for x in (corners, ways))

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
 
 from jsmitsm.cloud.cloud import Cloud
-from jsmitsm.cloud.domain_quadrature import domain_rule, surface_rule
+from jsmitsm.cloud.domain_quadrature import SMOOTH, domain_rule, surface_rule
 from jsmitsm.cloud.regions.region_cloud import RegionCloud, sides
 from jsmitsm.cloud.triangulation import boundary_facets
 from jsmitsm.runtime.errors import explaining, is_whole
 
-# A particle's normal is like a facet's if it is within 30 degrees of the facet's own; beyond, there is a corner.
-_SMOOTH = math.cos(math.radians(30.0))
 # Boundary particles around a facet among which its group is looked for.
 _AROUND = 30
 
@@ -125,6 +122,6 @@ def _members(cloud: Cloud, facets: np.ndarray, normal: np.ndarray, group: str) -
     points, own, rim = np.asarray(cloud.points), np.asarray(cloud.normals), cloud.boundary
     count = min(_AROUND, len(rim))
     near = rim[cKDTree(points[rim]).query(points[facets].mean(axis=1), k=range(1, count + 1))[1]]
-    alike = np.nan_to_num(np.sum(own[near] * normal[:, None], axis=2), nan=-1.0) >= _SMOOTH
+    alike = np.nan_to_num(np.sum(own[near] * normal[:, None], axis=2), nan=-1.0) >= SMOOTH
     first = np.take_along_axis(near, alike.argmax(axis=1)[:, None], axis=1)[:, 0]
     return np.where(alike.any(axis=1), named[first], mask)
