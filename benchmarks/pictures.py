@@ -94,7 +94,7 @@ def time(plt):
         drum, cloud, (lambda x: jnp.exp(-((x[0] - 0.3) ** 2 + x[1] ** 2) / 0.04), 0.0), t=(0.0, 1.8), steps=72,
         order=6, save=3,
     )  # fmt: skip
-    fig, axes = plt.subplots(1, 4, figsize=(11, 2.9), layout="constrained")
+    fig, axes = plt.subplots(1, 4, figsize=(11, 3.2), layout="constrained")
     for ax, t, u in zip(axes, run.t, run.u):
         js.plot.values(cloud, u, colorbar=False, ax=ax)
         ax.set_title(f"t = {t:.1f}, {float(u.min()):.2f} to {float(u.max()):.2f}", fontsize="medium")

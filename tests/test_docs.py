@@ -62,3 +62,5 @@ def test_code_of_pages_is_at_most_80_columns_wide():
     for page in DOCS.glob("*.md"):
         for block in re.findall(r"^```python\n(.*?)^```", page.read_text(), re.M | re.S):
             assert max(map(len, block.splitlines())) <= 80, (page.name, max(block.splitlines(), key=len))
+    for example in (DOCS / "gallery").glob("*.py"):
+        assert max(map(len, example.read_text().splitlines())) <= 80, example.name

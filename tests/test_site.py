@@ -110,6 +110,11 @@ def test_nothing_is_raw_and_nothing_comes_from_another_host(site):
         visible = re.sub(r"<script.*?</script>", "", text, flags=re.S)
         assert not re.search(r":(func|class|meth|mod|attr):", visible), page.name
         assert "arithmatex" not in text and not re.search(r"\\(frac|sum|partial|nabla)\b", visible), page.name
+        blocks = "".join(re.findall(r"<code>(?:<span|<a).*?</code>", visible, re.S))
+        code = html.unescape(re.sub(r"<[^>]+>", "", blocks))
+        wide = [line for line in code.splitlines() if line.startswith((">>> ", "... ")) and len(line) > 84]
+        assert not wide, (page.name, wide)
+        assert not re.search(r"\\\(", re.sub(r"<(code|pre)\b.*?</\1>", "", visible, flags=re.S)), page.name
         fetched = re.findall(r'<(?:script|img|link|iframe)[^>]*(?:src|href)="(https?://[^"]*)"', text)
         assert not fetched, (page.name, fetched)
     assert "<math" in (site / "methods.html").read_text()

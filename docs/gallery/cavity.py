@@ -1,8 +1,8 @@
 """Stokes' flow in a cavity
 
 The lid moves, and the fluid turns round. 0.1001 of it flows between the middle
-of the vortex and the wall, in units of the lid's speed and length; the pressure is
-infinite in the upper corners.
+of the vortex and the wall, in units of the lid's speed and length; the pressure
+is infinite in the upper corners.
 """
 
 import jax

@@ -1,9 +1,9 @@
 """Flow in a cavity at Re = 100
 
-The lid moves, and the fluid turns round. Without divergence a flow is one stream
-function, whose contours are the stream lines: one field, one equation of fourth
-order. -0.103423 is the least of it (Ghia, Ghia and Shin, 1982). The flags name the
-upper corners, where the lid's speed jumps.
+The lid moves, and the fluid turns round. Without divergence a flow is one
+stream function, whose contours are the stream lines: one field, one equation
+of fourth order. -0.103423 is the least of it (Ghia, Ghia and Shin, 1982). The
+flags name the upper corners, where the lid's speed jumps.
 """
 
 import jax

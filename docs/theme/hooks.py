@@ -5,6 +5,7 @@ import ast
 import html
 import json
 import re
+from itertools import chain, groupby
 from pathlib import Path
 
 import griffe
@@ -74,20 +75,29 @@ def cards(match):
     return '<div class="gallery" markdown>\n' + "\n".join(made) + "\n</div>"
 
 
+def fenced(lines):
+    return f"```text\n{''.join(lines).rstrip()}\n```"
+
+
+def shown(data):
+    """What a cell showed: a picture, or else its text."""
+    if "image/png" not in data:
+        return fenced(data.get("text/plain", []))
+    picture = "".join(data["image/png"]).replace("\n", "")
+    return f'<img alt="drawn by the code above" src="data:image/png;base64,{picture}">'
+
+
 def notebook(content):
     """A notebook as Markdown: text, code, what the code printed, pictures."""
     parts = []
     for cell in content["cells"]:
         source = "".join(cell["source"])
         parts.append(source if cell["cell_type"] == "markdown" else f"```python\n{source}\n```")
-        for output in cell.get("outputs", []):
-            data = output.get("data", {})
-            text = "".join(output.get("text", data.get("text/plain", []))).rstrip()
-            if "image/png" in data:
-                picture = "".join(data["image/png"]).replace("\n", "")
-                parts.append(f'<img alt="drawn by the code above" src="data:image/png;base64,{picture}">')
-            elif text and output.get("name") != "stderr":
-                parts.append(f"```text\n{text}\n```")
+        for name, outputs in groupby(cell.get("outputs", []), lambda output: output.get("name")):
+            if name == "stdout":  # one text, however often it was flushed
+                parts.append(fenced(chain.from_iterable(output["text"] for output in outputs)))
+            elif name != "stderr":
+                parts += [shown(output["data"]) for output in outputs]
     return "\n\n".join(parts)
 
 

@@ -66,7 +66,9 @@ class Adapted:
     >>> import jsmitsm as js
     >>> ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(0.0)}
     >>> problem = js.Problem(lambda u, x: js.laplacian(u)(x) + 1.0, ends)
-    >>> found = js.adapt(problem, lambda spacing: js.interval(0.0, 1.0, spacing=spacing), 1e-6)
+    >>> found = js.adapt(
+    ...     problem, lambda spacing: js.interval(0.0, 1.0, spacing=spacing), 1e-6
+    ... )
     >>> found.reached, found.flags
     (True, [])
     """
@@ -95,7 +97,9 @@ class Adapted:
         >>> import jsmitsm as js
         >>> ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(0.0)}
         >>> problem = js.Problem(lambda u, x: js.laplacian(u)(x) + 1.0, ends)
-        >>> found = js.adapt(problem, lambda spacing: js.interval(0.0, 1.0, spacing=spacing), 1e-6)
+        >>> found = js.adapt(
+        ...     problem, lambda spacing: js.interval(0.0, 1.0, spacing=spacing), 1e-6
+        ... )
         >>> "FLAG" in found.diagnose()
         False
         """
@@ -186,8 +190,12 @@ def adapt(
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jsmitsm as js
     >>> corner = [(0, 0), (1, 0), (1, 1), (-1, 1), (-1, -1), (0, -1)]
-    >>> problem = js.Problem(lambda u, x: js.laplacian(u)(x) + 1.0, {"boundary": js.dirichlet(0.0)})
-    >>> found = js.adapt(problem, lambda spacing: js.from_polygon(corner, spacing), 5e-3)
+    >>> problem = js.Problem(
+    ...     lambda u, x: js.laplacian(u)(x) + 1.0, {"boundary": js.dirichlet(0.0)}
+    ... )
+    >>> found = js.adapt(
+    ...     problem, lambda spacing: js.from_polygon(corner, spacing), 5e-3
+    ... )
     >>> found.reached, found.error < 5e-3
     (True, True)
     """

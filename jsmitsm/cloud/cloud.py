@@ -85,7 +85,9 @@ class Cloud:
     Examples
     --------
     >>> import numpy as np, jsmitsm as js
-    >>> cloud = js.Cloud(np.array([[0.0], [0.5], [1.0]]), {"interior": [1], "ends": [0, 2]})
+    >>> cloud = js.Cloud(
+    ...     np.array([[0.0], [0.5], [1.0]]), {"interior": [1], "ends": [0, 2]}
+    ... )
     >>> len(cloud), cloud.spacing
     (3, 0.5)
     """

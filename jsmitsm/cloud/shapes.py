@@ -73,9 +73,18 @@ def from_sdf(
     Examples
     --------
     >>> import jsmitsm as js
-    >>> plate = js.sdf.difference(js.sdf.rectangle((0, 0), (2, 1)), js.sdf.circle((1, 0.5), 0.25))
-    >>> cloud = js.from_sdf(plate, ((0, 0), (2, 1)), 0.05, groups={
-    ...     "hole": lambda x: abs(x - [1, 0.5]).max(axis=1) < 0.3, "outer": lambda x: x[:, 0] > -1})
+    >>> plate = js.sdf.difference(
+    ...     js.sdf.rectangle((0, 0), (2, 1)), js.sdf.circle((1, 0.5), 0.25)
+    ... )
+    >>> cloud = js.from_sdf(
+    ...     plate,
+    ...     ((0, 0), (2, 1)),
+    ...     0.05,
+    ...     groups={
+    ...         "hole": lambda x: abs(x - [1, 0.5]).max(axis=1) < 0.3,
+    ...         "outer": lambda x: x[:, 0] > -1,
+    ...     },
+    ... )
     >>> sorted(cloud.groups), len(cloud.groups["hole"])
     (['hole', 'interior', 'outer'], 31)
     """

@@ -63,7 +63,10 @@ class Problem:
     Examples
     --------
     >>> import jsmitsm as js
-    >>> js.Problem(lambda u, x: js.laplacian(u)(x) - 1.0, {"left": js.dirichlet(0.0), "right": js.neumann(0.0)})
+    >>> js.Problem(
+    ...     lambda u, x: js.laplacian(u)(x) - 1.0,
+    ...     {"left": js.dirichlet(0.0), "right": js.neumann(0.0)},
+    ... )
     Problem(fields=1, left: dirichlet(value=0.0), right: neumann(value=0.0))
     """
 
@@ -153,7 +156,11 @@ class Problem:
         Examples
         --------
         >>> import jsmitsm as js
-        >>> problem = js.Problem(lambda u, x, k: k * js.laplacian(u)(x), {"left": js.dirichlet(0.0)}, params=1.0)
+        >>> problem = js.Problem(
+        ...     lambda u, x, k: k * js.laplacian(u)(x),
+        ...     {"left": js.dirichlet(0.0)},
+        ...     params=1.0,
+        ... )
         >>> problem.replace(params=2.0).params
         2.0
         """

@@ -52,7 +52,13 @@ class Evolution(Copied):
     >>> import jax.numpy as jnp, jsmitsm as js
     >>> ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(0.0)}
     >>> heat = js.Problem(lambda u, x, t: js.dt(u)(x) - js.laplacian(u)(x), ends)
-    >>> run = js.evolve(heat, js.interval(0.0, 1.0, 21), lambda x: jnp.sin(jnp.pi * x[0]), t=(0.0, 0.1), steps=20)
+    >>> run = js.evolve(
+    ...     heat,
+    ...     js.interval(0.0, 1.0, 21),
+    ...     lambda x: jnp.sin(jnp.pi * x[0]),
+    ...     t=(0.0, 0.1),
+    ...     steps=20,
+    ... )
     >>> run
     Evolution(t: 0 to 0.1, u: 2x21, converged=True)
     >>> bool(abs(run.at(0.05)([[0.5]])[0] - jnp.exp(-jnp.pi**2 * 0.05)) < 1e-4)

@@ -117,7 +117,15 @@ def evolve(
     ...     {"left": js.dirichlet(0.0), "right": js.neumann(0.0)},
     ...     params=0.5,
     ... )
-    >>> run = js.evolve(problem, cloud, lambda x: jnp.sin(jnp.pi * x[0] / 2), t=(0.0, 1.0), steps=20, order=6, save=4)
+    >>> run = js.evolve(
+    ...     problem,
+    ...     cloud,
+    ...     lambda x: jnp.sin(jnp.pi * x[0] / 2),
+    ...     t=(0.0, 1.0),
+    ...     steps=20,
+    ...     order=6,
+    ...     save=4,
+    ... )
     >>> run.u.shape, run.t.tolist(), run.flags
     ((5, 31), [0.0, 0.25, 0.5, 0.75, 1.0], [])
     >>> bool(abs(run.u[-1, -1] - jnp.exp(-jnp.pi**2 / 8)) < 1e-8)

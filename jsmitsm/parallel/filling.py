@@ -50,7 +50,11 @@ def cloud_from(make: Callable[..., Any], *arguments: Any, **options: Any) -> Par
 
     Examples
     --------
-    ``cloud = jp.cloud_from(js.from_sdf, js.sdf.sphere((0, 0, 0), 1.0), ((-1, -1, -1), (1, 1, 1)), 0.02)``
+    On every process::
+
+        ball = js.sdf.ball((0, 0, 0), 1.0)
+        box = ((-1, -1, -1), (1, 1, 1))
+        cloud = jp.cloud_from(js.from_sdf, ball, box, 0.02)
     """
     us = team()
     with us.phase():

@@ -73,9 +73,15 @@ def from_mesh(mesh: Any, tags: str | None = None, *, regions: bool | list[str] =
     --------
     >>> import meshio, numpy as np, jsmitsm as js
     >>> corners = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0.5, 0.5, 0]]
-    >>> mesh = meshio.Mesh(corners, [("triangle", [[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]]),
-    ...                              ("line", [[0, 1], [1, 2]])], cell_data={"gmsh:physical": [[7] * 4, [1, 2]]},
-    ...                    field_data={"bottom": np.array([1, 1]), "side": np.array([2, 1])})
+    >>> mesh = meshio.Mesh(
+    ...     corners,
+    ...     [
+    ...         ("triangle", [[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]]),
+    ...         ("line", [[0, 1], [1, 2]]),
+    ...     ],
+    ...     cell_data={"gmsh:physical": [[7] * 4, [1, 2]]},
+    ...     field_data={"bottom": np.array([1, 1]), "side": np.array([2, 1])},
+    ... )
     >>> js.files.from_mesh(mesh)
     Cloud(5 particles in 2D, groups {interior: 1, bottom: 2, side: 1, boundary: 1}, cell groups {7: 5})
     """
@@ -122,7 +128,12 @@ def from_shapely(polygon: Any, spacing: Any, seed: int = 0, groups: Any = None) 
     Examples
     --------
     >>> import shapely, jsmitsm as js
-    >>> sorted(js.files.from_shapely(shapely.box(0, 0, 2, 1).difference(shapely.Point(1, 0.5).buffer(0.2)), 0.1).groups)
+    >>> sorted(
+    ...     js.files.from_shapely(
+    ...         shapely.box(0, 0, 2, 1).difference(shapely.Point(1, 0.5).buffer(0.2)),
+    ...         0.1,
+    ...     ).groups
+    ... )
     ['boundary', 'hole0', 'interior']
     """
     if isinstance(polygon, str):
@@ -170,7 +181,9 @@ def to_mesh(sol: Solution, **more: Any) -> Any:
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jsmitsm as js
     >>> ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(1.0)}
-    >>> sol = js.solve(js.Problem(lambda u, x: js.laplacian(u)(x), ends), js.interval(0.0, 1.0, 9))
+    >>> sol = js.solve(
+    ...     js.Problem(lambda u, x: js.laplacian(u)(x), ends), js.interval(0.0, 1.0, 9)
+    ... )
     >>> js.files.to_mesh(sol).point_data["u"].shape
     (9,)
     """

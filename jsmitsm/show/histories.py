@@ -90,7 +90,13 @@ def tuning(result: Any, *, ax: Any = None) -> Any:
     Examples
     --------
     >>> import jsmitsm as js
-    >>> axes = js.plot.tuning({"objective": [1e-2, 3e-3, 2e-3], "h": [0.10, 0.09, 0.085], "d": [4.0, 3.9, 3.9]})
+    >>> axes = js.plot.tuning(
+    ...     {
+    ...         "objective": [1e-2, 3e-3, 2e-3],
+    ...         "h": [0.10, 0.09, 0.085],
+    ...         "d": [4.0, 3.9, 3.9],
+    ...     }
+    ... )
     """
     history = getattr(result, "history", result)
     if not isinstance(history, (Mapping, list, tuple)) or not len(history):
@@ -154,7 +160,9 @@ def convergence(spacing: Any, errors: Any, *, floor: float = 1e-13, xlabel: str 
     Examples
     --------
     >>> import jsmitsm as js
-    >>> ax = js.plot.convergence([0.1, 0.05, 0.025], {"S, order 4": [1e-4, 6.3e-6, 3.9e-7]})
+    >>> ax = js.plot.convergence(
+    ...     [0.1, 0.05, 0.025], {"S, order 4": [1e-4, 6.3e-6, 3.9e-7]}
+    ... )
     >>> [text.get_text() for text in ax.texts]
     ['order 4.00']
     """
@@ -215,7 +223,11 @@ def adaptation(found: Any, *, ax: Any = None) -> np.ndarray:
     >>> import jsmitsm as js
     >>> ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(1.0)}
     >>> problem = js.Problem(lambda u, x: js.laplacian(u)(x) - 2.0, ends)
-    >>> axes = js.plot.adaptation(js.adapt(problem, lambda spacing: js.interval(0.0, 1.0, spacing=spacing), 1e-4))
+    >>> axes = js.plot.adaptation(
+    ...     js.adapt(
+    ...         problem, lambda spacing: js.interval(0.0, 1.0, spacing=spacing), 1e-4
+    ...     )
+    ... )
     """
     if not all(hasattr(found, name) for name in ("solution", "cloud", "history", "tol")):
         raise ValueError(f"found: expected what js.adapt returned, got {type(found).__name__}")

@@ -66,7 +66,12 @@ def cloud(what: Cloud | Solution, *, normals: bool = False, support: int | None 
     --------
     >>> import jsmitsm as js
     >>> square = js.rectangle((0, 0), (1, 1), (6, 6))
-    >>> ax = js.plot.cloud(square, normals=True, support=14, kernel=js.Gaussian(h=square.spacing, d=2.0))
+    >>> ax = js.plot.cloud(
+    ...     square,
+    ...     normals=True,
+    ...     support=14,
+    ...     kernel=js.Gaussian(h=square.spacing, d=2.0),
+    ... )
     """
     shown: Cloud = what.cloud if isinstance(what, Solution) else what
     if not isinstance(shown, Cloud):
@@ -202,7 +207,9 @@ def fields(sol: Solution, *, names: Sequence[str] | None = None, ax: Any = None,
     --------
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jax.numpy as jnp, jsmitsm as js
-    >>> pde = lambda u, x: jnp.stack([js.laplacian(u[0])(x) - u[1](x), js.laplacian(u[1])(x) - 1.0])
+    >>> pde = lambda u, x: jnp.stack(
+    ...     [js.laplacian(u[0])(x) - u[1](x), js.laplacian(u[1])(x) - 1.0]
+    ... )
     >>> ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(0.0)}
     >>> beam = js.solve(js.Problem(pde, ends, fields=2), js.interval(0.0, 1.0, 9))
     >>> axes = js.plot.fields(beam, names=["deflection", "moment"])
@@ -326,7 +333,9 @@ def error(sol: Solution, exact: Any, *, field: int = 0, log: bool = True, ax: An
     >>> import jsmitsm as js
     >>> problem = js.Problem(lambda u, x: js.laplacian(u)(x) - 12 * x[0] ** 2,
     ...                      {"left": js.dirichlet(0.0), "right": js.dirichlet(1.0)})
-    >>> ax = js.plot.error(js.solve(problem, js.interval(0.0, 1.0, 9), order=2), lambda x: x[0] ** 4)
+    >>> ax = js.plot.error(
+    ...     js.solve(problem, js.interval(0.0, 1.0, 9), order=2), lambda x: x[0] ** 4
+    ... )
     """
     _of(sol).refuse_stacked()
     truth = drawing.at_points(exact, np.asarray(sol.cloud.points)) if callable(exact) else exact

@@ -47,7 +47,14 @@ def animate(run: Any, *, field: int = 0, frames: int | None = None, interval: fl
     >>> import jax.numpy as jnp, jsmitsm as js
     >>> ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(0.0)}
     >>> heat = js.Problem(lambda u, x, t: js.dt(u)(x) - js.laplacian(u)(x), ends)
-    >>> run = js.evolve(heat, js.interval(0.0, 1.0, 11), lambda x: jnp.sin(jnp.pi * x[0]), t=(0, 0.1), steps=8, save=4)
+    >>> run = js.evolve(
+    ...     heat,
+    ...     js.interval(0.0, 1.0, 11),
+    ...     lambda x: jnp.sin(jnp.pi * x[0]),
+    ...     t=(0, 0.1),
+    ...     steps=8,
+    ...     save=4,
+    ... )
     >>> js.plot.animate(run).to_jshtml().count("data:image/png")
     5
     """
@@ -117,7 +124,13 @@ def to_pvd(run: Any, path: Any) -> None:
     >>> import os, tempfile, jax.numpy as jnp, jsmitsm as js
     >>> ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(0.0)}
     >>> heat = js.Problem(lambda u, x, t: js.dt(u)(x) - js.laplacian(u)(x), ends)
-    >>> run = js.evolve(heat, js.interval(0.0, 1.0, 11), lambda x: jnp.sin(jnp.pi * x[0]), t=(0, 0.1), steps=8)
+    >>> run = js.evolve(
+    ...     heat,
+    ...     js.interval(0.0, 1.0, 11),
+    ...     lambda x: jnp.sin(jnp.pi * x[0]),
+    ...     t=(0, 0.1),
+    ...     steps=8,
+    ... )
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     js.files.to_pvd(run, os.path.join(folder, "rod.pvd"))
     ...     len(os.listdir(folder))

@@ -57,7 +57,11 @@ def solid(sol: Solution, *, field: int = 0, cut: Mapping[str, float] | None = No
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jsmitsm as js
     >>> box = js.box((0, 0, 0), (1, 1, 1), (4, 4, 4))
-    >>> sides = {side: js.dirichlet(lambda x: x[0] * x[1]) for side in box.groups if side != "interior"}
+    >>> sides = {
+    ...     side: js.dirichlet(lambda x: x[0] * x[1])
+    ...     for side in box.groups
+    ...     if side != "interior"
+    ... }
     >>> sol = js.solve(js.Problem(lambda u, x: js.laplacian(u)(x), sides), box, order=2)
     >>> ax = js.plot.solid(sol, cut={"x": 0.5}, engine="matplotlib")
     """

@@ -110,7 +110,9 @@ def to_csv(what: Cloud | Solution, path: Any) -> None:
     Examples
     --------
     >>> import os, tempfile, jsmitsm as js
-    >>> js.files.to_csv(js.interval(0.0, 1.0, 3), os.path.join(tempfile.mkdtemp(), "cloud.csv"))
+    >>> js.files.to_csv(
+    ...     js.interval(0.0, 1.0, 3), os.path.join(tempfile.mkdtemp(), "cloud.csv")
+    ... )
     """
     columns = _columns(a_kind(what, (Cloud, Solution), "what"))
     for name in set(columns["group"]):
@@ -187,7 +189,9 @@ def to_xarray(sol: Solution, **more: Any) -> Any:
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jsmitsm as js
     >>> ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(1.0)}
-    >>> sol = js.solve(js.Problem(lambda u, x: js.laplacian(u)(x), ends), js.interval(0.0, 1.0, 9))
+    >>> sol = js.solve(
+    ...     js.Problem(lambda u, x: js.laplacian(u)(x), ends), js.interval(0.0, 1.0, 9)
+    ... )
     >>> js.files.to_xarray(sol).u.sizes["particle"]
     9
     """

@@ -57,7 +57,9 @@ def vectors(sol: Solution, *, of: Callable | None = None, count: int = 20, label
     >>> import jsmitsm as js
     >>> square = js.rectangle((0, 0), (1, 1), (6, 6))
     >>> sides = {side: js.dirichlet(0.0) for side in ("left", "right", "bottom", "top")}
-    >>> sol = js.solve(js.Problem(lambda u, x: js.laplacian(u)(x) + 1.0, sides), square, order=2)
+    >>> sol = js.solve(
+    ...     js.Problem(lambda u, x: js.laplacian(u)(x) + 1.0, sides), square, order=2
+    ... )
     >>> ax = js.plot.vectors(sol, count=8)
     """
     dim = _space(sol, "vectors")
@@ -133,8 +135,13 @@ def streamlines(sol: Solution, *, of: Callable | None = None, density: float = 1
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jsmitsm as js
     >>> square = js.rectangle((0, 0), (1, 1), (6, 6))
-    >>> sides = {side: js.dirichlet(lambda x: x[0] * x[1]) for side in ("left", "right", "bottom", "top")}
-    >>> sol = js.solve(js.Problem(lambda u, x: js.laplacian(u)(x), sides), square, order=2)
+    >>> sides = {
+    ...     side: js.dirichlet(lambda x: x[0] * x[1])
+    ...     for side in ("left", "right", "bottom", "top")
+    ... }
+    >>> sol = js.solve(
+    ...     js.Problem(lambda u, x: js.laplacian(u)(x), sides), square, order=2
+    ... )
     >>> ax = js.plot.streamlines(sol)
     """
     if _space(sol, "streamlines") == 3:
@@ -191,7 +198,9 @@ def deformed(sol: Solution, *, scale: float | None = None, colour: Callable | No
     >>> sheared = js.dirichlet(lambda x: jnp.stack([0.2 * x[1], 0.0]))
     >>> sides = {side: sheared for side in ("left", "right", "bottom", "top")}
     >>> pde = lambda u, x: jnp.stack([js.laplacian(u[0])(x), js.laplacian(u[1])(x)])
-    >>> ax = js.plot.deformed(js.solve(js.Problem(pde, sides, fields=2), square, order=2))
+    >>> ax = js.plot.deformed(
+    ...     js.solve(js.Problem(pde, sides, fields=2), square, order=2)
+    ... )
     """
     dim, numbers = _space(sol, "deformed"), drawing.real("sol", sol.u)
     if numbers.ndim < 2 or numbers.shape[1] < dim:

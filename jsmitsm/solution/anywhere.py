@@ -213,7 +213,10 @@ class Anywhere(Copied):
         >>> import jax; jax.config.update("jax_enable_x64", True)
         >>> import jsmitsm as js
         >>> ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(1.0)}
-        >>> sol = js.solve(js.Problem(lambda u, x: js.laplacian(u)(x) - 2.0, ends), js.interval(0.0, 1.0, 9))
+        >>> sol = js.solve(
+        ...     js.Problem(lambda u, x: js.laplacian(u)(x) - 2.0, ends),
+        ...     js.interval(0.0, 1.0, 9),
+        ... )
         >>> round(float(sol.integral()), 12)  # of x^2
         0.333333333333
         """

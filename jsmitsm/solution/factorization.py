@@ -39,7 +39,10 @@ class Factorization(KeptMatrix):
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jsmitsm as js
     >>> ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(0.0)}
-    >>> js.factorize(js.Problem(lambda u, x: js.laplacian(u)(x) + 1.0, ends), js.interval(0.0, 1.0, 11))
+    >>> js.factorize(
+    ...     js.Problem(lambda u, x: js.laplacian(u)(x) + 1.0, ends),
+    ...     js.interval(0.0, 1.0, 11),
+    ... )
     Factorization(9 unknowns, method='S')
     """
 

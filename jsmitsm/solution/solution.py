@@ -59,13 +59,20 @@ class Solution(Anywhere):
     >>> import jsmitsm as js
     >>> ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(1.0)}
     >>> # The answer is x^3.
-    >>> sol = js.solve(js.Problem(lambda u, x: js.laplacian(u)(x) - 6 * x[0], ends), js.interval(0.0, 1.0, 9))
+    >>> sol = js.solve(
+    ...     js.Problem(lambda u, x: js.laplacian(u)(x) - 6 * x[0], ends),
+    ...     js.interval(0.0, 1.0, 9),
+    ... )
     >>> sol
     Solution(u: 9, method='S', order=4, depth=4, converged=True)
-    >>> [round(float(value[0]), 9) for value in (sol([[0.3]]), sol.grad([[0.3]])[0], sol.derivative([[0.3]], (2,)))]
+    >>> x = [[0.3]]
+    >>> found = sol(x)[0], sol.grad(x)[0, 0], sol.derivative(x, (2,))[0]
+    >>> [round(float(value), 9) for value in found]
     [0.027, 0.27, 1.8]
-    >>> round(float(sol.flux("right")), 9), sol.coefficients.shape, bool(sol.error_estimate().max() < 1e-12), sol.flags
-    (3.0, (9, 9), True, [])
+    >>> round(float(sol.flux("right")), 9), sol.coefficients.shape
+    (3.0, (9, 9))
+    >>> bool(sol.error_estimate().max() < 1e-12), sol.flags
+    (True, [])
     """
 
     def __init__(self, values, cloud, recipe, fit, converged, iterations, stats, fitted=None, report=None):

@@ -158,7 +158,9 @@ def tune(
     >>> import jsmitsm as js
     >>> cloud = js.interval(0.0, 1.0, 17)
     >>> ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(0.0)}
-    >>> problem = js.Problem(lambda u, x: js.laplacian(u)(x) + jnp.sin(jnp.pi * x[0]), ends)
+    >>> problem = js.Problem(
+    ...     lambda u, x: js.laplacian(u)(x) + jnp.sin(jnp.pi * x[0]), ends
+    ... )
     >>> start = js.SuperGaussian(h=2 * cloud.spacing, d=4.0)
     >>> found = js.tune(problem, cloud, start, order=3, steps=10)
     >>> bool(found.history["objective"].min() < found.history["objective"][0] / 2)

@@ -11,7 +11,9 @@ so that the gradient is exact *on* the boundary, where particles are put.
 Examples
 --------
 >>> import jax.numpy as jnp, jsmitsm as js
->>> plate = js.sdf.difference(js.sdf.rectangle((0, 0), (2, 1)), js.sdf.circle((1, 0.5), 0.25))
+>>> plate = js.sdf.difference(
+...     js.sdf.rectangle((0, 0), (2, 1)), js.sdf.circle((1, 0.5), 0.25)
+... )
 >>> float(plate(jnp.array([1.0, 0.5])))
 0.25
 """

@@ -34,7 +34,8 @@ def union(*shapes: Sdf) -> Sdf:
     Examples
     --------
     >>> import jax.numpy as jnp, jsmitsm as js
-    >>> float(js.sdf.union(js.sdf.circle((0, 0), 1.0), js.sdf.circle((3, 0), 1.0))(jnp.array([3.0, 0.0])))
+    >>> left, right = js.sdf.circle((0, 0), 1.0), js.sdf.circle((3, 0), 1.0)
+    >>> float(js.sdf.union(left, right)(jnp.array([3.0, 0.0])))
     -1.0
     """
     return _combine(jnp.minimum, shapes)
@@ -61,7 +62,8 @@ def intersection(*shapes: Sdf) -> Sdf:
     Examples
     --------
     >>> import jax.numpy as jnp, jsmitsm as js
-    >>> float(js.sdf.intersection(js.sdf.circle((0, 0), 1.0), js.sdf.circle((1, 0), 1.0))(jnp.array([0.5, 0.0])))
+    >>> left, right = js.sdf.circle((0, 0), 1.0), js.sdf.circle((1, 0), 1.0)
+    >>> float(js.sdf.intersection(left, right)(jnp.array([0.5, 0.0])))
     -0.5
     """
     return _combine(jnp.maximum, shapes)
@@ -90,7 +92,8 @@ def difference(shape: Sdf, *holes: Sdf) -> Sdf:
     Examples
     --------
     >>> import jax.numpy as jnp, jsmitsm as js
-    >>> float(js.sdf.difference(js.sdf.circle((0, 0), 2.0), js.sdf.circle((0, 0), 1.0))(jnp.array([1.5, 0.0])))
+    >>> disk, hole = js.sdf.circle((0, 0), 2.0), js.sdf.circle((0, 0), 1.0)
+    >>> float(js.sdf.difference(disk, hole)(jnp.array([1.5, 0.0])))
     -0.5
     """
     return intersection(shape, *map(complement, holes))
@@ -141,7 +144,8 @@ def smooth_union(first: Sdf, second: Sdf, radius: Any) -> Sdf:
     Examples
     --------
     >>> import jax.numpy as jnp, jsmitsm as js
-    >>> float(js.sdf.smooth_union(js.sdf.circle((-1, 0), 1.0), js.sdf.circle((1, 0), 1.0), 0.5)(jnp.zeros(2)))
+    >>> left, right = js.sdf.circle((-1, 0), 1.0), js.sdf.circle((1, 0), 1.0)
+    >>> float(js.sdf.smooth_union(left, right, 0.5)(jnp.zeros(2)))
     -0.125
     """
     radius = positive("radius", radius)
@@ -177,7 +181,8 @@ def translate(shape: Sdf, offset: Any) -> Sdf:
     Examples
     --------
     >>> import jax.numpy as jnp, jsmitsm as js
-    >>> float(js.sdf.translate(js.sdf.circle((0, 0), 1.0), (3, 0))(jnp.array([3.0, 0.0])))
+    >>> moved = js.sdf.translate(js.sdf.circle((0, 0), 1.0), (3, 0))
+    >>> float(moved(jnp.array([3.0, 0.0])))
     -1.0
     """
     offset = vector("offset", offset)
@@ -293,7 +298,8 @@ def round(shape: Sdf, radius: Any) -> Sdf:
     Examples
     --------
     >>> import jax.numpy as jnp, jsmitsm as js
-    >>> float(js.sdf.round(js.sdf.rectangle((0, 0), (2, 1)), 0.25)(jnp.array([1.0, 2.0])))
+    >>> rounded = js.sdf.round(js.sdf.rectangle((0, 0), (2, 1)), 0.25)
+    >>> float(rounded(jnp.array([1.0, 2.0])))
     0.75
     """
     radius = positive("radius", radius)

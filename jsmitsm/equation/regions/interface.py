@@ -58,7 +58,9 @@ def interface(
     --------
     >>> import jsmitsm as js
     >>> k = {"steel": 50.0, "wool": 0.05}
-    >>> js.interface(flux={name: lambda u, x, n, k=k[name]: k * n @ js.grad(u)(x) for name in k})
+    >>> js.interface(
+    ...     flux={name: lambda u, x, n, k=k[name]: k * n @ js.grad(u)(x) for name in k}
+    ... )
     interface(flux of 'steel' and 'wool', jump=0.0, source=0.0)
     """
     if (flux is None) == (residual is None):

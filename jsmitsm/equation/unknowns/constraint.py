@@ -61,7 +61,10 @@ def constraint(functional: Callable[..., Any], value: float = 0.0) -> Constraint
     >>> import jsmitsm as js
     >>> problem = js.Problem(
     ...     lambda u, x, g: js.laplacian(u)(x) - 1.0 + g["q"],
-    ...     {"left": js.neumann(lambda x, g: 0.0), "right": js.neumann(lambda x, g: 0.0)},
+    ...     {
+    ...         "left": js.neumann(lambda x, g: 0.0),
+    ...         "right": js.neumann(lambda x, g: 0.0),
+    ...     },
     ...     unknowns={"q": 0.0},
     ...     constraints=[js.constraint(lambda sol: sol.integral(), 2.0)],
     ... )

@@ -76,7 +76,9 @@ def point_source(x0: ArrayLike, strength: ArrayLike = 1.0) -> PointSource:
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import numpy as np
     >>> import jsmitsm as js
-    >>> disk = js.from_sdf(js.sdf.circle((0.0, 0.0), 1.0), ((-1.0, -1.0), (1.0, 1.0)), 0.2)
+    >>> disk = js.from_sdf(
+    ...     js.sdf.circle((0.0, 0.0), 1.0), ((-1.0, -1.0), (1.0, 1.0)), 0.2
+    ... )
     >>> problem = js.Problem(
     ...     lambda u, x: js.laplacian(u)(x),
     ...     {"boundary": js.dirichlet(0.0)},

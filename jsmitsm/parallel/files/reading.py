@@ -55,7 +55,12 @@ def read(
 
     Examples
     --------
-    ``cloud = jp.read("points.npy", "groups.npy", "normals.npy", names={"interior": 0, "wall": 1})``
+    On every process::
+
+        cloud = jp.read(
+            "points.npy", "groups.npy", "normals.npy",
+            names={"interior": 0, "wall": 1},
+        )
     """
     us = team()
     with us.phase():

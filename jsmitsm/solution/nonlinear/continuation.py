@@ -98,11 +98,15 @@ def continuation(
     >>> import jax.numpy as jnp
     >>> import jsmitsm as js
     >>> ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(0.0)}
-    >>> bratu = lambda c: js.Problem(lambda u, x: js.laplacian(u)(x) + c * jnp.exp(u(x)), ends)
+    >>> bratu = lambda c: js.Problem(
+    ...     lambda u, x: js.laplacian(u)(x) + c * jnp.exp(u(x)), ends
+    ... )
     >>> sols = js.continuation(bratu, js.interval(0.0, 1.0, 21), [1.0, 2.0, 3.0])
     >>> [round(float(sol.u[10]), 4) for sol in sols]
     [0.1405, 0.329, 0.6401]
-    >>> around = js.continuation(bratu, js.interval(0.0, 1.0, 21), [1.0, 2.0, 2.0], arclength=True)
+    >>> around = js.continuation(
+    ...     bratu, js.interval(0.0, 1.0, 21), [1.0, 2.0, 2.0], arclength=True
+    ... )
     >>> [round(float(sol.u[10]), 2) for sol in around], round(around.folds[0], 3)
     ([0.14, 0.33, 2.9], 3.514)
     """

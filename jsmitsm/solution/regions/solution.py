@@ -35,8 +35,12 @@ class RegionsSolution(Solution):
     >>> k = {"a": 1.0, "b": 3.0}
     >>> flux = {name: lambda u, x, n, k=k[name]: k * n @ js.grad(u)(x) for name in k}
     >>> bcs = {"boundary": js.dirichlet(lambda x: x[0]), "a|b": js.interface(flux=flux)}
-    >>> sol = js.solve(js.Problem({name: lambda u, x: js.laplacian(u)(x) for name in k}, bcs), cloud)
-    >>> round(float(sol([[0.5]], region="b")[0]), 12), round(float(sol.flux("a|b", 1.0, region="a")), 12)
+    >>> sol = js.solve(
+    ...     js.Problem({name: lambda u, x: js.laplacian(u)(x) for name in k}, bcs),
+    ...     cloud,
+    ... )
+    >>> value, flux = sol([[0.5]], region="b")[0], sol.flux("a|b", region="a")
+    >>> round(float(value), 12), round(float(flux), 12)
     (0.75, 1.5)
     """
 
