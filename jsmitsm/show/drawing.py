@@ -98,11 +98,16 @@ def dress(ax: Any, dim: int) -> None:
         ax.set(yticks=[], xlabel="x")
         ax.spines[["left", "right", "top"]].set_visible(False)
         return
-    ax.set_aspect("equal")
     labels(ax, *AXES[:2])
-    if dim == 3:
-        ax.set_zlabel("z")
-        ax.locator_params(nbins=5)  # more would run into one another in perspective
+    if dim == 2:
+        ax.set_aspect("equal")
+        return
+    ax.set_zlabel("z")
+    ax.locator_params(nbins=5)  # more would run into one another in perspective
+    for axis in (ax.xaxis, ax.yaxis):
+        axis.labelpad = 9  # beyond the numbers, which lie aslant
+    ax.zaxis.labelpad = 2
+    ax.set_box_aspect(np.ptp([ax.get_xlim(), ax.get_ylim(), ax.get_zlim()], axis=1), zoom=0.75)  # room for the names
 
 
 def labels(ax: Any, x: str, y: str) -> None:
