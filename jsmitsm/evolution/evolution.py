@@ -26,8 +26,8 @@ from jsmitsm.solution.solution import Solution
 class Evolution(Copied):
     """A solution in time, at saved moments and between them.
 
-    ``at(t)`` is the solution at any time, callable like a ``js.Solution``. To go on from the end give ``u0=run.u[-1]``, of
-    second order ``u0=(run.u[-1], run.rate[-1])``.
+    ``at(t)`` is the solution at any time, callable like a ``js.Solution``. To go on from the end give
+    ``u0=run.u[-1]``, of second order ``u0=(run.u[-1], run.rate[-1])``.
 
     Attributes
     ----------

@@ -37,7 +37,6 @@ class Normals(Mapping[str, Any]):
 class RegionCloud(Cloud):
     """A cloud of several regions; made by ``js.regions``.
 
-
     ``cloud.region("a")`` is the cloud of one region, with outward normals.
 
     Attributes
