@@ -28,7 +28,7 @@ from jsmitsm.runtime import one_kernel
 from jsmitsm.runtime.collector import uncollected
 from jsmitsm.runtime.compiler_options import on_cpu
 from jsmitsm.runtime.jaxprs import Literal, Primitive, jaxpr_as_fun
-from jsmitsm.runtime.size_classes import BLOCK
+from jsmitsm.runtime.size_classes import BLOCK, largest_at_hand
 from jsmitsm.runtime.threads import cores, side_by_side
 from jsmitsm.runtime.tracers import is_traced, recorded
 
@@ -126,9 +126,23 @@ class Rows(NamedTuple):
     arguments: tuple[bool | str, ...]
     summed: tuple[bool, ...]
 
+    def length(self, arguments: Sequence[Any]) -> int:
+        return next(len(x) for x, flag in zip(arguments, self.arguments, strict=True) if flag is True)
+
+    def others(self, arguments: Sequence[Any]) -> tuple[Any, ...]:
+        """What a program is compiled for, but the number of rows."""
+        kinds = zip(_avals(arguments), self.arguments, strict=True)
+        return tuple((a.shape[1:] if flag is True else a.shape, a.dtype) for a, flag in kinds)
+
+    def filled(self, arguments: Sequence[Any], more: int) -> list[Any]:
+        """So many more rows, which nobody wants."""
+        rows = [np.asarray(x) if flag is True else x for x, flag in zip(arguments, self.arguments, strict=True)]
+        return [np.concatenate([x, np.broadcast_to(x[:1], (more, *x.shape[1:]))]) if flag is True else x
+                for x, flag in zip(rows, self.arguments, strict=True)]  # fmt: skip
+
     def shares(self, arguments: Sequence[Any]) -> list[Share] | None:
         """Equal shares, the last one filled up by rows without weight; None where sharing does not pay."""
-        n = next(len(x) for x, flag in zip(arguments, self.arguments, strict=True) if flag is True)
+        n = self.length(arguments)
         size = -(-n // (cores() * BLOCK)) * BLOCK
         if cores() < 2 or size < _WORTH or jax.default_backend() != "cpu":
             return None
@@ -162,6 +176,8 @@ class Program:
         rows: Rows | None = None,
     ):  # fmt: skip
         self.rows = rows
+        self.stops = base and rows is not None and COUNT in rows.arguments  # after the rows wanted
+        self.lengths: dict[Any, set[int]] = {}  # in rows, of what is compiled, by all else
         self.name, self.options, self.on_host, self.small = name, options, base and options is None, small
         self.function, self.trace = function, jax.jit(function).trace
         self.results: dict[Any, Result] = {}
@@ -184,8 +200,22 @@ class Program:
     def run(self, *arguments: Any) -> Any:
         if self.on_host:
             return self.function(*map(np.asarray, arguments))
+        if self.stops and self.rows is not None:
+            self.lengths.setdefault(self.rows.others(arguments), set()).add(self.rows.length(arguments))
         with uncollected():
             return self._run(*arguments)
+
+    def at_hand(self, arguments: Sequence[Any]) -> list[Any]:
+        """The results, by what is compiled for more rows where that stops after those wanted."""
+        if not self.stops or self.rows is None:
+            return jax.tree.leaves(self.run(*arguments))
+        n = self.rows.length(arguments)
+        lengths = self.lengths.get(self.rows.others(arguments), ())
+        size = min((s for s in lengths if n <= s <= largest_at_hand(n)), default=n)
+        if size == n:
+            return jax.tree.leaves(self.run(*arguments))
+        out = jax.tree.leaves(self.run(*self.rows.filled(arguments, size - n)))
+        return [jax.device_put(np.asarray(x)[:n]) for x in out]
 
     def _run(self, *arguments: Any) -> Any:
         config: Any = jax.config
@@ -321,10 +351,10 @@ def _impl(*arguments: Any, program: Program) -> list[Any]:
     rows = program.rows
     shared = None if rows is None else rows.shares(arguments)
     if rows is not None and shared is not None:
-        one = lambda share: [np.asarray(x) for x in jax.tree.leaves(program.run(*share.arguments))]  # noqa: E731
+        one = lambda share: [np.asarray(x) for x in program.at_hand(share.arguments)]  # noqa: E731
         parts = side_by_side(one, shared, lambda share: (program, share.rows))
         return [jax.device_put(x) for x in rows.together(list(parts), shared)]
-    out = jax.tree.leaves(program.run(*arguments))
+    out = program.at_hand(arguments)
     if program.on_host:
         avals = program.result(_avals(arguments)).avals
         return [jax.device_put(np.asarray(x, a.dtype)) for x, a in zip(out, avals, strict=True)]

@@ -35,3 +35,19 @@ def test_derivatives_are_those_of_the_whole(monkeypatch, transform):
     whole = transform(lambda s, x, y: total(s, x, y, None))(scale, X, y)
     # Sums of 170 terms in another order.
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12), shared, whole)
+
+
+def test_what_is_differentiated_runs_as_the_program_of_more_rows():
+    """Which is at hand, and stops after the rows wanted: nothing is compiled for fewer of them."""
+    scale, y = np.array([0.3, 0.9]), np.stack([X, np.cos(X)], axis=1)
+    arguments = {"count": np.int32(N), "scale": scale, "x": X, "y": y}
+    called(made, {}, arguments, (), rows=ROWS)
+    leaves, tree = jax.tree.flatten(arguments)
+    program = whole_program._whole(made, (), tree, (), False, tuple(jax.tree.leaves(ROWS)))
+    before = program.compiled._cache_size()
+    some = lambda rows: jax.value_and_grad(lambda x: jnp.sum(  # noqa: E731
+        called(made, {}, {"count": np.int32(70), "scale": scale, "x": x, "y": y[:70]}, (), rows=rows)["two"]
+    ))(X[:70])  # fmt: skip
+    for a, b in zip(some(ROWS), some(None)):
+        np.testing.assert_allclose(a, b, rtol=1e-13)
+    assert program.compiled._cache_size() == before
