@@ -16,9 +16,13 @@ from jsmitsm.parallel.pencil.evolution import ParallelEvolution, evolve
 from jsmitsm.parallel.pencil.modes import ParallelModes, eigen
 from jsmitsm.parallel.solution import ParallelSolution, evaluate, norm
 from jsmitsm.parallel.solving import solve
+from jsmitsm.parallel.team import end_together, launched_with_others
 
 __all__ = [
     "ParallelCloud", "ParallelEvolution", "ParallelFactorization", "ParallelModes", "ParallelSolution",
     "cloud_from", "eigen", "error_estimate", "evaluate", "evolve", "factorize", "norm", "read", "save", "solve",
     "value_and_grad",
 ]  # fmt: skip
+
+if launched_with_others():
+    end_together()

@@ -106,6 +106,7 @@ class ParallelSolution(OfOwn):
 
     def gathered(self) -> np.ndarray | None:
         """Values (N,) or (N, F) of the whole cloud in its order, on the first process; None on the others."""
+        self._team.gather(None)  # who failed says so here
         parts = self._team.comm.gather((self.numbers, self.u), root=0)
         if parts is None:
             return None

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import atexit
 import ctypes
+import multiprocessing
+import os
 import sys
 import time
-import traceback
 from functools import cache
 from importlib import import_module
+from importlib.util import find_spec
 from types import TracebackType
 from typing import Any
 
@@ -17,6 +20,10 @@ from jsmitsm.runtime.errors import SolveError, some
 
 # Seconds that the others leave the first process for the message.
 PATIENCE = 5.0
+# Where launchers say how many processes they started: Open MPI's, MPICH's and Intel's, MVAPICH's, Slurm's.
+LAUNCHED = ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "MV2_COMM_WORLD_SIZE", "SLURM_STEP_NUM_TASKS")
+# What a process that left the script tells those that go on with it.
+LEFT = ("SolveError", "the script ended, while other processes go on with it", ())
 # The option of glibc's mallopt, and the bytes from which on an array is large.
 _MMAP_THRESHOLD, _LARGE = -3, 1 << 18
 
@@ -124,17 +131,43 @@ def _as_told(kind: str, text: str, particles: tuple[int, ...]) -> Exception:
 def team() -> Team:
     """The processes under mpiexec. From now on an error that leaves one of them ends them all, with its message."""
     mpi = engine("mpi4py.MPI")
-    found = Team(mpi.COMM_WORLD)
+    # A communicator of their own: what the script tells by another is not mistaken for theirs.
+    found = Team(mpi.COMM_WORLD.Dup())
     _large_apart()
     if found.size > 1:
-
-        def stop(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
-            if getattr(error, "told", False) and found.rank:
-                time.sleep(PATIENCE)  # the first process tells the error of all, and ends them
-            print(f"process {found.rank} of {found.size}:", file=sys.stderr)
-            traceback.print_exception(kind, error, trace)
-            sys.stderr.flush()
-            found.comm.Abort(1)
-
-        sys.excepthook = stop
+        end_together()
     return found
+
+
+def launched_with_others() -> bool:
+    """Whether this process is one of several that a launcher of MPI started, as far as the environment tells."""
+    told = [os.environ.get(name, "") for name in LAUNCHED]
+    several = any(one.isdecimal() and int(one) > 1 for one in told)
+    return several and multiprocessing.parent_process() is None and find_spec("mpi4py") is not None
+
+
+@cache
+def end_together() -> None:
+    """From now on a process that an error ends takes the others with it, and one that leaves tells them."""
+    before = sys.excepthook
+
+    def stop(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+        if getattr(error, "told", False) and team().rank:
+            time.sleep(PATIENCE)  # the first process tells the error of all, and ends them
+        before(kind, error, trace)
+        world = engine("mpi4py.MPI").COMM_WORLD
+        if world.Get_size() > 1:
+            print(f"process {world.Get_rank()} of {world.Get_size()} ends them all", file=sys.stderr, flush=True)
+            world.Abort(1)
+
+    sys.excepthook = stop
+    atexit.register(_leave)
+
+
+def _leave() -> None:
+    """Meet those that go on with the script, until all have left it: they would wait for this process for ever."""
+    if engine("mpi4py.MPI").Is_finalized():
+        return
+    us = team()
+    while any(fault != LEFT for fault, _ in us.comm.allgather((LEFT, None))):
+        pass

@@ -132,18 +132,20 @@ def test_parts_of_a_shape_are_the_whole(found):
     assert found["filled"] == 0.0 and found["dealt"] == 0.0
 
 
-def test_the_failure_of_one_and_an_interrupt_end_all():
-    """Two runs at a time: one that fails on its second process, one that waits and gets what Ctrl-C sends."""
-    start = "import jsmitsm.parallel as jp, mpi4py.MPI as m, time, sys\njp.norm([1.0])\n"
-    fails = begun(2, "-c", start + "if m.COMM_WORLD.rank: raise RuntimeError('the second one fell')\njp.norm([1.0])")
-    # One process works, the other waits for it in MPI.
-    waits = begun(2, "-c", start + "if m.COMM_WORLD.rank: print('begun', flush=True); time.sleep(600)\njp.norm([1.0])")
+def test_what_ends_one_ends_all():
+    """Runs at a time, whose second process falls, leaves, or works while the other waits for it in MPI."""
+    start = "import jsmitsm.parallel as jp, mpi4py.MPI as m, time, sys\nif m.COMM_WORLD.rank: "
+    fails = begun(2, "-c", start + "raise RuntimeError('the second one fell')\njp.norm([1.0])")
+    leaves = begun(2, "-c", start + "jp.norm([1.0]); sys.exit(0)\njp.norm([1.0]); jp.norm([2.0])")
+    waits = begun(2, "-c", start + "print('begun', flush=True); time.sleep(600)\njp.norm([1.0])")
     assert waits.stdout.readline().strip() == "begun"
-    waits.send_signal(signal.SIGINT)
+    waits.send_signal(signal.SIGINT)  # what Ctrl-C sends
     assert waits.wait(timeout=60) != 0
-    _, said = fails.communicate(timeout=120)
-    assert fails.returncode != 0
-    assert "process 1 of 2" in said and "the second one fell" in said
+    for run, words in ((fails, ("the second one fell", "process 1 of 2 ends them all")),
+                       (leaves, ("the script ended, while other processes go on", "on process 1 of 2"))):  # fmt: skip
+        _, said = run.communicate(timeout=120)
+        assert run.returncode != 0
+        assert all(some in said for some in words), said
 
 
 def test_gradients_are_those_of_one_process(of_two):
