@@ -25,7 +25,8 @@ class Measured:
     particle to it, in a scale of their own. scale: the largest |u|. apart: the distance to the solution of another
     order, infinite where that is not known to the last. number: of the quantity, if there is one. gathered: the error
     that contributions (N,) of random signs make, in the scale of theirs; None where that is not known. local (N,): the
-    estimate at every particle, relative to the largest |u|; None where the tolerance is on something else."""
+    estimate at every particle, relative to the largest |u|; None where the tolerance is on something else. missed (N,):
+    the same of what is not seen between the particles."""
 
     error: float
     contribution: np.ndarray
@@ -34,6 +35,7 @@ class Measured:
     number: float | None = None
     gathered: Callable[[np.ndarray], float] | None = None
     local: np.ndarray | None = None
+    missed: np.ndarray | float = 0.0
 
 
 def measured(sol: Solution, spacing: np.ndarray, order: int, norm: str, quantity: Quantity | None) -> Measured:
@@ -61,9 +63,11 @@ def measured(sol: Solution, spacing: np.ndarray, order: int, norm: str, quantity
         # A step of Newton's method leads to another order but about.
         exact = sol.iterations == 1 and sol.defects
         apart = of(found.towards) if exact else np.inf
-        local = np.abs(error).max(axis=1) / scale if norm == "max" and scale > 0 else None
+        known = norm == "max" and scale > 0
+        local = np.abs(error).max(axis=1) / scale if known else None
+        unseen = np.abs(missed[0]).max(axis=1) / scale if known and missed is not None else 0.0
         gathered = _gathering(found, far, defect.shape, norm)
-        return Measured(relative, contribution, scale, apart, gathered=gathered, local=local)
+        return Measured(relative, contribution, scale, apart, gathered=gathered, local=local, missed=unseen)
     number, weights = _weights(sol, quantity)
     if weights is None:  # nothing differentiable: the whole solution stands for the number
         return Measured(relative, contribution, scale, number=number)

@@ -36,10 +36,15 @@ _GAP = 10.0
 # Where smoothness ends solutions of two orders miss the same, and are nearer to each other than to what is true: the
 # distance is taken for this part of the error.
 _ALIKE = 0.5
+# What is missed of a source between the particles is that as well, where contributions fall with less than this power:
+# there no mean over a few points tells what its infinite values make.
+_INFINITE = 1.0
 # The numbers of two rounds may differ by so many times what the first was thought to be off by.
 _AGREE = 3.0
 # Where they part, at a corner most often, that falls with this power of the spacing.
 _PARTED = 0.5
+# Where they part by so many times what they may, that is known to be the point, and worth more than a round.
+_TORN = 30.0
 # While only that is wanting, the error at the particles may go back to so many of the usual aims.
 _EASED = 1.5
 # A cloud of this part of the particles that are allowed is the last.
@@ -277,8 +282,10 @@ class Rounds:
         """The error where smoothness ends, of which the estimate sees a part."""
         if found.local is None or self.before is None:
             return 0.0
-        slow = self._marks(found, cloud, spacing).rate < SLOW
-        return float(found.local[slow].max(initial=0.0)) / _ALIKE
+        rate = self._marks(found, cloud, spacing).rate
+        infinite = (rate < _INFINITE) & (self.data is not None and self.data.traced.unbounded_source)
+        seen = np.where(infinite, np.maximum(found.local, found.missed), found.local)
+        return float(seen[rate < SLOW].max(initial=0.0)) / _ALIKE
 
     def _disagreed(self) -> float:
         """By how much the number changed unforeseen: what makes it of the values, a quadrature say, errs too."""
@@ -336,6 +343,8 @@ class Rounds:
         made_h, _ = next_spacing(here, power, error, wanted, most, found.gathered)
         if apart is not None:
             parted = marks(points, h, apart, power, None, expected=_PARTED)
+            torn = apart > _TORN * _GAP * self.tol * found.scale
+            parted = parted._replace(located=parted.singular & torn)
             finer, _ = next_spacing(parted, power, float(apart.max()) / found.scale / _GAP, self.tol, most)
             made_h = np.where(finer < h, np.minimum(made_h, finer), made_h)
         field = SpacingField(points, made_h, spacing.largest)

@@ -17,7 +17,7 @@ from jsmitsm.discretization.layout import Class, Discretization, mean_spacing
 from jsmitsm.discretization.least_squares import misfit
 from jsmitsm.discretization.leave_one_out import matrix, right_side, with_held
 from jsmitsm.discretization.resolution.digits import lags, room
-from jsmitsm.discretization.rows import all_rows
+from jsmitsm.discretization.rows import all_coefficients, all_rows
 from jsmitsm.linear.linsolve import times
 from jsmitsm.particle.moments import Row
 from jsmitsm.particle.recursion import constraints
@@ -52,7 +52,7 @@ class Correction:
     error (N, F): the estimated u_exact - u, with its sign.
     towards (N, F): what leads to the solution of the other order, of which the error may be a part.
     made: the defect (N, F), for ``defect``; None for the methods other than S, which have none.
-    between: for ``missed``, None where there is no source that rows could miss.
+    between: for ``missed``, None where there is nothing that rows could miss.
     adjoint: of weights (N, F) of the values in a number, those of the defects in it; None where there are no rows.
     through: of defects (N, F) what they make of u; None where there are no rows.
     units (F,): what the fields are multiplied with to be compared with one another.
@@ -71,7 +71,7 @@ class Correction:
         """What the source makes of u where its Taylor series do not tell it between the particles, and the defect.
 
         (N, F) each; rows of all orders miss it alike, and so does the distance of their solutions. None where the
-        source is constant, or the equation nonlinear.
+        source is constant and no coefficient has kinks.
         """
         return None if self.between is None else self.between()
 
@@ -134,7 +134,8 @@ def correction(fit: Fit, values: Any, made: Run | None = None) -> Correction:
         return spread(run.factor_of(*matrix(low, *own())).solve(right, transpose=transpose)[: len(free)])
 
     def between() -> Any:
-        defect = unseen(low, nums(), fit.problem, own())
+        fitted = lambda: np.asarray(all_coefficients(low, nums(), values), float)
+        defect = unseen(low, nums(), fit.problem, own(), fitted)
         if defect is None:
             return None
         return through(defect), defect

@@ -1,5 +1,7 @@
 """A tolerance in, an answer out: what is reached is so, what is not is said."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -150,6 +152,10 @@ def test_a_kink_of_the_source_is_in_the_error():
     source = lambda x: jnp.where(x[0] > 0.3, 1.0, -1.0)
     problem = js.Problem(lambda u, x: js.laplacian(u)(x) - source(x), ends(-0.045, 0.245))
     found = js.adapt(problem, line, 1e-3, max_rounds=1)
+    assert found.error < 5 * true_error(found, bent) and true_error(found, bent) < 3 * found.error
+    # The same in a nonlinear equation, whose source is what it leaves of the solution.
+    pde = lambda u, x: js.laplacian(u)(x) - u(x) ** 2 - source(x) + bent(x) ** 2
+    found = js.adapt(js.Problem(pde, ends(-0.045, 0.245)), line, 1e-3, max_rounds=1)
     assert found.error < 5 * true_error(found, bent) and true_error(found, bent) < 3 * found.error
     exact = js.Problem(lambda u, x: js.laplacian(u)(x) - jnp.sin(40.0 * x[0]), ends(0.0, 0.0))
     smooth = js.solve(exact, js.interval(0.0, 1.0, 15)).correction()  # resolved by what rows know of it
@@ -340,6 +346,12 @@ def test_where_smoothness_ends_the_estimate_is_half_of_the_error():
     search.rows = [(101, 4, 1e-2, 0.0, 0.02), (101, 4, 3e-4, 0.0, 0.01)]
     search.before = Marks(x, np.full(101, 0.02), np.ones(101), np.full(101, 5.0), none, none)
     assert search._doubted(found, cloud, field) == pytest.approx(4e-4)
+    # Of a source that is infinite there, what is seen between the particles is such a part too.
+    missed = np.where(x[:, 0] < 0.05, 5e-4, 0.0)
+    assert search._doubted(replace(found, missed=missed), cloud, field) == pytest.approx(4e-4)  # a kink, perhaps
+    infinite = js.Problem(lambda u, x: js.laplacian(u)(x) - x[0] ** -1.5, ends(0.0, 0.0))
+    search.data = data_of(infinite, 1, 4)
+    assert search._doubted(replace(found, missed=missed), cloud, field) == pytest.approx(1e-3)
 
 
 # ------------------------------------------------------------------ bad input

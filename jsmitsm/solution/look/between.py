@@ -267,14 +267,19 @@ def _made_of(run: Any, nums: Numbers) -> np.ndarray:
     if run.formulation == "lsq":
         right = least_squares(disc, nums)[3]
     else:
-        classes, rows = run.rows
-        if not disc.scheme.sourced or disc.scheme.method in ("I", "II"):
-            # Rows of a problem without a source lack its weights; those of I and II hold the neighbours' sources.
-            disc = replace(disc, scheme=replace(disc.scheme, sourced=True))
-            disc.classes = [replace(cls, scheme=replace(cls.scheme, sourced=True)) for cls in classes]
-            classes, rows = all_rows(disc, nums)
-        right = right_side(disc, nums, classes, rows)
+        right = _right(disc, nums, run.rows)
     return solved_alone(run, np.asarray(right))
+
+
+def _right(disc: Discretization, nums: Numbers, made: Any) -> np.ndarray:
+    """The right-hand side that rows make of the source and data of ``nums``."""
+    classes, rows = made
+    if not disc.scheme.sourced or disc.scheme.method in ("I", "II"):
+        # Rows of a problem without a source lack its weights; those of I and II hold the neighbours' sources.
+        disc = replace(disc, scheme=replace(disc.scheme, sourced=True))
+        disc.classes = [replace(cls, scheme=replace(cls.scheme, sourced=True)) for cls in classes]
+        classes, rows = all_rows(disc, nums)
+    return np.asarray(right_side(disc, nums, classes, rows))
 
 
 def solved_alone(run: Any, right: np.ndarray) -> np.ndarray:
@@ -313,14 +318,29 @@ def with_source(nums: Numbers, source: np.ndarray) -> Numbers:
     return replace(nums, source=source, held=zero(nums.held), given=zero(nums.given), gamma=zero(nums.gamma))
 
 
-def unseen(disc: Discretization, nums: Numbers, problem: Problem, rows: Any) -> np.ndarray | None:
-    """What the rows miss of the source (N, F), in the scale of u; None where there is no source, or a nonlinear one.
+def unseen(
+    disc: Discretization, nums: Numbers, problem: Problem, rows: Any, fitted: Callable[[], np.ndarray]
+) -> np.ndarray | None:
+    """What the rows miss of the data (N, F), in the scale of u; None where there is nothing to miss.
 
     The rows know a source by its Taylor series at the particles. What differs from them halfway to the neighbours,
-    beside a kink, a jump or a point where it is infinite, is no less real, and rows of all orders miss it alike.
+    beside a kink, a jump or a point where it is infinite, is no less real, and rows of all orders miss it alike. Of
+    coefficients with kinks, and of a nonlinear equation about the solution, it is what their series cannot promise.
     """
-    if not disc.linear or disc.traced.source != "variable" or not disc.scheme.sourced or np.shape(nums.source)[-1] < 2:
+    traced = disc.traced
+    varies = traced.source == "variable" and np.shape(nums.source)[-1] > 1
+    found = [_source_left_out(disc, nums, problem, rows)] if disc.linear and varies else []
+    if (has_kinks(disc) and not (disc.linear and traced.kinked_source)) or (not disc.linear and varies):
+        found.append(out_of_series(disc, nums, problem, fitted()).source)
+    if not found:
         return None
+    missed, made = max(found, key=lambda some: np.abs(some).max(initial=0.0)), np.zeros(disc.held.shape)
+    made[~disc.held] = _right(disc, with_source(nums, missed), rows)
+    return made
+
+
+def _source_left_out(disc: Discretization, nums: Numbers, problem: Problem, rows: Any) -> np.ndarray:
+    """By how much the source of a linear equation halfway to the neighbours differs from its series, as a source."""
     points, place = np.asarray(disc.points, float), _places(disc, nums)
     known, missed = np.asarray(nums.source), np.zeros((disc.rec.n_rows, len(nums.ids)))
     series = [[k for k, (e, _) in enumerate(disc.rec.row_index) if e == f] for f in range(len(disc.rec.orders))]
@@ -335,9 +355,7 @@ def unseen(disc: Discretization, nums: Numbers, problem: Problem, rows: Any) -> 
             return np.where(np.isfinite(away), away, 0.0)  # infinite on the boundary
 
         missed[np.array(disc.rec.equation_rows)[:, None], at] = _around(disc, cls, points, left)
-    found = np.zeros(disc.held.shape)
-    found[~disc.held] = np.asarray(right_side(disc, with_source(nums, missed), *rows))
-    return found
+    return missed
 
 
 def _mean(disc: Discretization, problem: Problem, cls: Class, points: np.ndarray, fitted: np.ndarray) -> np.ndarray:
