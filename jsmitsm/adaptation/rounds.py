@@ -213,9 +213,10 @@ class Rounds:
         if self.lowered is not None and last[1] < self.lowered[0] and last[2] > self.lowered[1]:
             self.highest, self.shallow, self.hopeful = self.lowered[0], False, True
         elif len(self.rows) > 1 and last[2] > max(ROUGH, _HOPE * self.rows[-2][2]) and not self.hopeful:
-            # More particles do not help: Taylor polynomials of something that is not smooth, the fewer the better.
+            # More particles do not help: Taylor series of something that is not smooth. First the depth is too much.
             self.lowered = last[1], last[2]
-            self.highest, self.shallow = min(self.highest, max(self.rows[-1][1] - 2, self.least)), True
+            self.highest = min(self.highest, max(last[1] - 2 * self.shallow, self.least))
+            self.shallow = True
         return max(min(wanted, self.highest), self.least)
 
     # ------------------------------------------------------------------ clouds

@@ -313,10 +313,12 @@ def test_a_lower_order_that_does_worse_is_given_up():
     search, cloud = a_search(), js.interval(0.0, 1.0, 11)
     search.rows = [(10, 4, 3.0, 0.0, 0.1), (20, 4, 1.6, 0.0, 0.1)]
     search.least = 2
+    assert search._order(cloud) == 4 and search.shallow  # the depth goes first
+    search.rows.append((40, 4, 1.5, 0.0, 0.1))
     assert search._order(cloud) == 2 and search.shallow
-    search.rows.append((40, 2, 100.0, 0.0, 0.1))
+    search.rows.append((80, 2, 100.0, 0.0, 0.1))
     assert search._order(cloud) == 4 and not search.shallow
-    search.rows.append((80, 4, 90.0, 0.0, 0.1))
+    search.rows.append((160, 4, 90.0, 0.0, 0.1))
     assert search._order(cloud) == 4
 
 
