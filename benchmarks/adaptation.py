@@ -138,11 +138,11 @@ def tally(rows: list[dict[str, Any]]) -> str:
     fewer = sum(a < b for a, b in map(sizes, both))
     quicker = sum(r["seconds"] < r["elements"]["seconds"] for r in both)
     large = [r["over_last"] for r in rows if r.get("particles", 0) > LARGE and "over_last" in r]
-    told = f"Of {len(both)} that both reach, fewer unknowns in {fewer}, less time in {quicker}."
+    told = [f"Of {len(both)} timed that both reach, fewer unknowns in {fewer}, less time in {quicker}."] if both else []
     if large:
-        told += (f" All rounds over the last where it has more than {LARGE} particles: {min(large):.1f} to "
-                 f"{max(large):.1f}, {sum(r > 2.5 for r in large)} of {len(large)} above 2.5.")  # fmt: skip
-    return told
+        told.append(f"All rounds over the last where it has more than {LARGE} particles: {min(large):.1f} to "
+                    f"{max(large):.1f} in {len(large)}.")  # fmt: skip
+    return " ".join(told)
 
 
 def table(rows: list[dict[str, Any]], cases: Any) -> dict[str, Any]:
