@@ -8,6 +8,7 @@ question, so that what is compiled knows how many rows of each count.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -18,6 +19,7 @@ from jsmitsm.discretization.layout import Discretization, mean_spacing, split
 from jsmitsm.discretization.parts.whole import ALONE, Whole
 from jsmitsm.equation.problem import Problem
 from jsmitsm.particle.recursion import Recursion, constraints, fit_and_tail, row_lifts
+from jsmitsm.runtime.errors import some
 from jsmitsm.runtime.tracers import any_number, concrete
 from jsmitsm.taylor.multi_indices import factorial, index_of
 
@@ -29,6 +31,8 @@ EMPTY = 1e-12
 # What is left of a row of unit length after those before it. Less adds nothing but rounding, which grows with every
 # row that is taken for another; a condition is left out only where the equation says the same.
 DEPENDENT, IMPLIED = 1e-2, 1e-4
+# What an equation and a condition say of one particle may differ by this part of the solution.
+CONTRADICTION = 1e-6
 
 
 @dataclass
@@ -44,6 +48,21 @@ class Degenerate:
     empty: np.ndarray
     conflicts: list[tuple[int, float, float]]
 
+    def contradicted(self, size: float) -> list[int]:
+        """The particles of which the equation and a condition say different things; size: of the solution."""
+        if not np.isfinite(size):
+            return []
+        return [i for i, off, slack in self.conflicts if off > (CONTRADICTION + 10.0 * slack) * size]
+
+
+def contradiction(particles: Any) -> str:
+    """What a solve says of such particles."""
+    return (
+        f"the equation at {len(particles)} particle(s), first {some(particles)}, where its leading coefficient "
+        "vanishes, says something of u by itself, and the condition or the source there contradicts it; correct them, "
+        "or give js.free() where the equation needs no condition"
+    )
+
 
 @dataclass
 class _Found:
@@ -56,23 +75,66 @@ class _Found:
     slack: float
 
 
+@dataclass(frozen=True)
+class Typical:
+    """What is typical of the whole cloud.
+
+    lead : of each equation the leading coefficient that most particles exceed.
+    size : of each equation the size of its own row.
+    below : the part of what is typical below which particles are looked at.
+    """
+
+    lead: list[float]
+    size: np.ndarray
+    below: float
+
+
+def typical(disc: Discretization, jac: np.ndarray, further: Callable[[np.ndarray], np.ndarray], told: Whole) -> Typical:
+    """What several processes decide together.
+
+    jac (E, S, 1, n): of degree 0, of all own particles; further: makes it of degree 2 for a mask (n,) of them.
+    """
+    lead = _leads(disc, jac, told)
+    near = np.any([(_lead(disc.rec, jac, e) <= LEADING * most) | (most == 0) for e, most in enumerate(lead)], axis=0)
+    count = int((_nearness(disc, further(near), lead) <= LEADING).sum()) if near.any() else 0
+    size = _scales(disc.rec, jac, 2.0 * mean_spacing(disc), told)
+    return Typical(lead, size, LEADING if told.total(count) <= MANY else TINY)
+
+
+def _powers(rec: Recursion, e: int) -> list[int]:
+    return [rec.levels[e] - sum(b) - rec.weights[f] for f, b in rec.slots]
+
+
+def _lead(rec: Recursion, jac: np.ndarray, e: int) -> np.ndarray:
+    """The largest leading coefficient of an equation, (n,)."""
+    return np.max([np.abs(jac[e, s, 0]) for s, p in enumerate(_powers(rec, e)) if p == 0], axis=0)
+
+
+def _leads(disc: Discretization, jac: np.ndarray, told: Whole) -> list[float]:
+    return [float(told.quantile(_lead(disc.rec, jac, e), MOST)) for e in range(len(jac))]
+
+
+def _nearness(disc: Discretization, jac: np.ndarray, usual: list[float]) -> np.ndarray:
+    """How near to zero (n,) the leading coefficients are, beside all others and what is usual."""
+    rec, length = disc.rec, 2.0 * mean_spacing(disc)
+    degree = [sum(t) for t in index_of(rec.dim, rec.degree)]
+    least = np.full(jac.shape[-1], np.inf)
+    near = [t for t, d in enumerate(degree[: jac.shape[2]]) if d <= 2]
+    for e, most in enumerate(usual):
+        lead = _lead(rec, jac, e)
+        every = np.max([np.abs(jac[e, s, t]) * length ** (p + degree[t]) for s, p in enumerate(_powers(rec, e))
+                        for t in near], axis=0)  # fmt: skip
+        every = np.minimum(every, most) if most > 0 else every
+        least = np.minimum(least, np.where(every > 0, lead / np.where(every > 0, every, 1.0), 0.0))
+    return least
+
+
 def candidates(disc: Discretization, jac: np.ndarray, told: Whole = ALONE) -> tuple[np.ndarray, np.ndarray]:
     """Those of the particles (n,) of jac (E, S, T, n) whose leading coefficients are near zero, and how near.
 
     told: what tells of the jac of all processes, where these ask together.
     """
-    rec, length = disc.rec, 2.0 * mean_spacing(disc)
-    degree = [sum(t) for t in index_of(rec.dim, rec.degree)]
-    least = np.full(jac.shape[-1], np.inf)
-    for e, level in enumerate(rec.levels):
-        powers = [level - sum(b) - rec.weights[f] for f, b in rec.slots]
-        lead = np.max([np.abs(jac[e, s, 0]) for s, p in enumerate(powers) if p == 0], axis=0)
-        near = [t for t, d in enumerate(degree[: jac.shape[2]]) if d <= 2]
-        every = np.max([np.abs(jac[e, s, t]) * length ** (p + degree[t]) for s, p in enumerate(powers) for t in near],
-                       axis=0)  # fmt: skip
-        usual = told.quantile(lead, MOST)
-        every = np.minimum(every, usual) if usual > 0 else every
-        least = np.minimum(least, np.where(every > 0, lead / np.where(every > 0, every, 1.0), 0.0))
+    least = _nearness(disc, jac, _leads(disc, jac, told))
     few = np.flatnonzero(least <= LEADING)
     few = few if told.total(len(few)) <= MANY else np.flatnonzero(least <= TINY)
     return few, least[few]
@@ -87,9 +149,8 @@ def settled(disc: Discretization, problem: Problem, nums: Any) -> Any:
         jac = concrete(nums.jac)
         jac = _in_general(disc, problem, nums.ids) if jac is None else np.asarray(jac)
         # What is not finite is told where the rows are made.
-        at, least = candidates(disc, jac) if np.isfinite(jac).all() else (np.zeros(0, int), np.zeros(0))
-        if len(at):
-            nums = _examined(disc, nums, jac, np.asarray(own), np.asarray(points), at, least)
+        if np.isfinite(jac).all():
+            nums = _examined(disc, nums, jac, np.asarray(own), np.asarray(points))
     if not all(map(_same, old, (disc.lost, disc.dropped))):
         disc.classes = [part for cls in disc.classes for part in split(disc, cls)]
     return nums
@@ -112,21 +173,22 @@ def _in_general(disc: Discretization, problem: Problem, ids: np.ndarray) -> np.n
     return np.asarray(traced.with_any_numbers().coefficients(points, disc.rec.degree, params=params, slots=slots)[0])
 
 
-def _examined(
-    disc: Discretization,
-    nums: Any,
-    jac: np.ndarray,
-    own: np.ndarray,
-    points: np.ndarray,
-    at: np.ndarray,
-    least: np.ndarray,
-) -> Any:
-    n, rec = len(disc.cloud), disc.rec
+def _examined(disc: Discretization, nums: Any, jac: np.ndarray, own: np.ndarray, points: np.ndarray) -> Any:
+    if disc.part is None or disc.part.typical is None:
+        at, least = candidates(disc, jac)
+        scale = _scales(disc.rec, jac, 2.0 * mean_spacing(disc)) if len(at) else np.zeros(0)
+    else:  # these are some of many particles, of which the processes decided together
+        usual = disc.part.typical
+        least, scale = _nearness(disc, jac, usual.lead), usual.size
+        at = np.flatnonzero(least <= usual.below)
+        least = least[at]
+    if not len(at):
+        return nums
+    n = len(disc.cloud)
     known = concrete(nums.jac) is not None
     source, given = (concrete(x) if known else None for x in (nums.source, nums.given))
     near, ids = np.asarray(concrete(disc.stencils.indices)), nums.ids
     found: dict[int, _Found] = {}
-    scale = _scales(rec, jac, 2.0 * mean_spacing(disc))
     for k in at:
         i = int(ids[k])
         around = near[i][near[i] >= 0]
@@ -145,7 +207,8 @@ def _examined(
         return nums
     disc.lost, disc.dropped = lost, dropped
     share = np.where(near >= 0, nothing[disc.images.owners(near)], False).sum(axis=1) / (near >= 0).sum(axis=1)
-    empty = np.flatnonzero(nothing[:n] & (share > 0.5))
+    # Of a part the neighbours may be others' to look at.
+    empty = np.flatnonzero(nothing[:n] & ((share > 0.5) | (disc.part is not None)))
     # A little beside an axis, at a distance that no cloud resolves, data are those of the axis.
     beside = dict(zip(ids[at].tolist(), least.tolist()))
     conflicts = [(i, one.conflict, max(one.slack, beside[i])) for i, one in found.items() if one.conflict > 0]
@@ -153,13 +216,12 @@ def _examined(
     return replace(nums, degenerate=told, **_first_kept(nums, {i: one.kept for i, one in found.items()}))
 
 
-def _scales(rec: Recursion, jac: np.ndarray, length: float) -> np.ndarray:
+def _scales(rec: Recursion, jac: np.ndarray, length: float, told: Whole = ALONE) -> np.ndarray:
     """The usual size of each equation's own row."""
     out = []
-    for e, level in enumerate(rec.levels):
-        powers = [level - sum(b) - rec.weights[f] for f, b in rec.slots]
-        sizes = [np.abs(jac[e, s, 0]) * length**p for s, p in enumerate(powers)]
-        out.append(float(np.median(np.max(sizes, axis=0))))
+    for e in range(len(rec.levels)):
+        sizes = [np.abs(jac[e, s, 0]) * length**p for s, p in enumerate(_powers(rec, e))]
+        out.append(float(told.quantile(np.max(sizes, axis=0), 0.5)))
     return np.array(out)
 
 
@@ -236,9 +298,9 @@ def _functionals(
 def _first_kept(nums: Any, kept: dict[int, list[int]]) -> dict[str, Any]:
     """The conditions of every particle with those that are kept first."""
     order = np.broadcast_to(np.arange(np.shape(nums.own)[1]), np.shape(nums.own)[:2]).copy()
-    for i, some in kept.items():
+    for i, first in kept.items():
         at = np.searchsorted(nums.own_ids, i)
         if at < len(nums.own_ids) and nums.own_ids[at] == i:
-            order[at] = [*some, *(k for k in range(order.shape[1]) if k not in some)]
+            order[at] = [*first, *(k for k in range(order.shape[1]) if k not in first)]
     row = np.arange(len(order))[:, None]
     return {"own": nums.own[row, order], "given": nums.given[row, order]}

@@ -37,6 +37,7 @@ class ParallelFactorization:
         self._local, self._solver = local, solver
         self._pieces: list[Piece] = []
         self.system, _ = assembled(local.team, local, solver, kept=self._pieces)
+        local.refuse_degenerate()
 
     @explaining
     def solve(self, problem: Problem) -> ParallelSolution:

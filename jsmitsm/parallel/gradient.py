@@ -75,6 +75,7 @@ def value_and_grad(
         raise ValueError(f"wrt: {wrt!r} is none of {', '.join(map(repr, WRT))}, or the problem has no params")
     sol = solve(problem, cloud, **options)
     us, local, taylor = sol._team, sol._local, sol._linearised
+    local.refuse_degenerate()
     halo = local.halo
     # Newton's last step was linearised at the iterate before.
     system = sol.system if taylor is None else assembled(us, local, options.get("solver", "auto"), lambda: taylor)[0]

@@ -16,6 +16,7 @@ from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.cloud.neighbours import EVEN_SAMPLE, Stencils, is_even, kept_distances, nearest
 from jsmitsm.discretization import health
 from jsmitsm.discretization.coefficients import Numbers, numbers, slot_series
+from jsmitsm.discretization.degenerate import Degenerate, contradiction, typical
 from jsmitsm.discretization.held_particles import with_held_expansions
 from jsmitsm.discretization.layout import Class, Discretization, discretize, sorted_classes, table
 from jsmitsm.discretization.operator_kind import information_travels
@@ -29,6 +30,7 @@ from jsmitsm.parallel.shares import local_kernel, local_problem
 from jsmitsm.parallel.team import Team, give_back
 from jsmitsm.particle.kernels import Kernel
 from jsmitsm.particle.moments import Row
+from jsmitsm.runtime.errors import SolveError
 from jsmitsm.solution.run import Run
 
 # The first halo reaches so many times the radius of this many nearest particles for every free coefficient of the fit.
@@ -62,6 +64,7 @@ class Local:
     def __init__(self, team: Team, problem: Problem, mine: Slab, settings: Settings):
         self.team, self.settings, self.mine = team, settings, mine
         self.problem = problem
+        self.degenerate: list[Degenerate] = []  # what was found of the equation at own particles, piece by piece
         self.boxes = boxes_of(team, mine)
         self._settle(team.most(first_reach(mine, settings.order)))
 
@@ -189,12 +192,45 @@ class Local:
 
     def numbers(self, disc: Discretization, taylor: Any = None) -> Numbers:
         nums = numbers(disc, disc.problem, taylor)
-        if nums.degenerate is not None:
+        if nums.degenerate is not None and len(nums.degenerate.empty):
             raise ValueError(
-                "pde: its highest derivatives lose their weight at some particles, and degenerate equations are not "
-                "made for several processes; use js.solve"
+                f"pde: it says nothing at {len(nums.degenerate.empty)} particle(s), where all its coefficients vanish; "
+                "hold their values (js.fix), leave them out of the cloud, or use js.solve"
             )
         return nums
+
+    def refuse_degenerate(self, found: Degenerate | None = None) -> None:
+        if self.team.total(int(bool(self.degenerate or found))):
+            raise ValueError(
+                "pde: its highest derivatives lose their weight at some particles, and for several processes such "
+                "equations are made by jp.solve alone; use one process"
+            )
+
+    def refuse_contradictions(self, values: np.ndarray) -> None:
+        """Raise where a degenerate equation and a condition say different things of a solution (n, F)."""
+        size = self.team.most(float(np.abs(values).max(initial=0.0)))
+        with self.team.phase(self.halo.slab.number):
+            bad = [i for found in self.degenerate for i in found.contradicted(size)]
+            if bad:
+                raise SolveError(contradiction(bad), bad)
+
+    def _decide(self, taylor: Any) -> None:
+        """What is typical of the equation in the whole cloud; and whether the least-squares form is needed."""
+        disc, ids = self.disc, self.disc.active
+
+        def jac(which: Any, degree: int) -> np.ndarray:
+            at = ids[which]
+            slots = None if taylor is None else slot_series(disc.rec, disc.traced.slots, taylor[at], degree)
+            points = np.asarray(disc.cloud.points)[at]
+            return np.asarray(disc.traced.coefficients(points, degree, params=disc.problem.params, slots=slots)[0])
+
+        every = jac(slice(None), 0)
+        if self.run.health is None and self.settings.formulation == "auto":
+            self._refuse_least_squares(every)
+        varies = self.settings.method == "S" and not disc.traced.constant
+        if varies and all(self.team.gather(np.isfinite(every).all())):
+            usual = typical(disc, every, lambda some: jac(some, min(2, disc.rec.degree)), self.whole)
+            self.part = self.disc.part = replace(self.part, typical=usual)
 
     def made(self, use: Use, start: Callable[[], Any] | None = None) -> list[Any]:
         """``use`` of the rows of some own particles after others; on a wider halo where a repair looked beyond it.
@@ -205,8 +241,8 @@ class Local:
             first = self.run.health is None
             taylor = None if start is None else start()
             with self.team.phase(self.halo.slab.number):
-                if first and self.settings.formulation == "auto":
-                    self._refuse_least_squares(taylor)
+                self._decide(taylor)
+                self.degenerate = []
                 found = [use(*piece) for piece in self._pieces(taylor)]
             missing = self.team.most(self._repairs_miss()) if first and self.settings.repair else 0.0
             if not self.widen(missing):
@@ -230,6 +266,8 @@ class Local:
         for some in _gathered(self.disc.classes):
             disc = self.only(some)
             nums = self.numbers(disc, taylor)
+            if nums.degenerate is not None:
+                self.degenerate.append(nums.degenerate)
             classes, rows = all_rows(disc, nums)
             if repair:
                 classes, rows, weak = health.parted(classes, rows)
@@ -266,17 +304,12 @@ class Local:
         self.run.health = before
         return found
 
-    def _refuse_least_squares(self, taylor: Any) -> None:
-        """Where information travels the least-squares form is right, of which the processes make none."""
-        disc, ids = self.disc, self.disc.active
-        slots = None if taylor is None else slot_series(disc.rec, disc.traced.slots, taylor[ids], 0)
-        points = np.asarray(disc.cloud.points)[ids]
-        jac, _ = disc.traced.coefficients(points, 0, params=disc.problem.params, slots=slots)
-        if any(self.team.gather(information_travels(disc, jac))):
+    def _refuse_least_squares(self, jac: np.ndarray) -> None:
+        if any(self.team.gather(information_travels(self.disc, jac))):
             raise ValueError(
-                'formulation: in this equation information travels (first order, or convection above diffusion), and '
-                'the least-squares form is not made for several processes; say formulation="loo" where diffusion '
-                "does resolve it, or use js.solve"
+                "formulation: in this equation information travels (first order, or convection above diffusion), and "
+                'the least-squares form, which is right there, is not made for several processes; say formulation="loo"'
+                " where diffusion does resolve it, or use js.solve"
             )
 
     def _repairs_miss(self) -> float:

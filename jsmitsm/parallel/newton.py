@@ -105,6 +105,7 @@ class _Search:
         local = self.local
         self.system, b = assembled(self.us, local, self.solver, at)
         values = spread(local, self.system.solve(b))
+        local.refuse_contradictions(values)
         return Iterate(values, local.expanded(values, at()))
 
     def tried(self, here: Iterate) -> Iterate | None:

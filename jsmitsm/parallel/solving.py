@@ -41,7 +41,7 @@ def solve(
     problem : Problem
         Of one field or several; a nonlinear one by Newton's damped steps. Not made for several processes: periodic
         pairs, several regions, constraints, unknowns, point sources, complex values, fields that only derivatives
-        determine, degenerate equations. All are refused by name.
+        determine. All are refused by name.
     cloud : Cloud or ParallelCloud
         A Cloud that every process made alike, or what ``jp.read`` returned. In 2D or 3D.
     method : {"S", "III"}
@@ -110,9 +110,10 @@ def solved(us: Team, local: Local, solver: str, u0: Any, began: float) -> Parall
         return sol
     system, b = assembled(us, local, solver)
     put = time.perf_counter()
-    x = system.solve(b)
+    values = spread(local, system.solve(b))
+    local.refuse_contradictions(values)
     seconds = {"local": put - began, "solve": time.perf_counter() - put, "total": time.perf_counter() - began}
-    return ParallelSolution(us, local, recipe(local), spread(local, x), system, seconds)
+    return ParallelSolution(us, local, recipe(local), values, system, seconds)
 
 
 def recipe(local: Local) -> Recipe:

@@ -13,6 +13,7 @@ import numpy as np
 
 from jsmitsm.discretization import health
 from jsmitsm.discretization.coefficients import Numbers, numbers
+from jsmitsm.discretization.degenerate import contradiction
 from jsmitsm.discretization.held_particles import with_held_expansions
 from jsmitsm.discretization.layout import Class, Discretization, discretize
 from jsmitsm.discretization.least_squares import least_squares
@@ -34,8 +35,6 @@ from jsmitsm.solution.statistics import of_run
 GROWN, BALANCED = 1e4, 1e-2
 # ... or, in the least-squares form, leave so much of the range in all fits, see ``jsmitsm.solution.balance.EVEN``.
 SPREAD = 1e-3
-# What an equation and a condition say of one particle may differ by this part of the solution.
-CONTRADICTION = 1e-6
 
 
 class Run:
@@ -183,15 +182,9 @@ class Run:
                 f"At {len(found.implied)} particle(s), first {some(found.implied)}, the equation itself says what a "
                 "condition does, as on an axis: the condition was left out."
             )
-        spread = float(np.abs(values).max(initial=0.0))
-        bad = [i for i, off, slack in found.conflicts if off > (CONTRADICTION + 10.0 * slack) * spread]
-        if bad and np.isfinite(spread):
-            self.fail(
-                f"the equation at {len(bad)} particle(s), first {some(bad)}, where its leading coefficient vanishes, "
-                "says something of u by itself, and the condition or the source there contradicts it; correct them, or "
-                "give js.free() where the equation needs no condition",
-                bad,
-            )
+        bad = found.contradicted(float(np.abs(values).max(initial=0.0)))
+        if len(bad):
+            self.fail(contradiction(bad), bad)
 
     def assembled(self, nums: Numbers, parts: list[Any] | None = None) -> tuple[Any, Any, Any, Any]:
         """The global system: entries of the matrix, their rows and columns, and the right-hand side.

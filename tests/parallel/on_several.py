@@ -108,6 +108,12 @@ def narrow():
     return js.Problem(lambda u, x: js.laplacian(u)(x) + peak(x), held)
 
 
+def axis():
+    """On the axis x = 0 the highest derivatives have no weight, and the condition says nothing new."""
+    held = {**{name: js.dirichlet(exact) for name in SIDES}, "left": js.neumann(0.0)}
+    return js.Problem(lambda u, x: x[0] * js.laplacian(u)(x) + js.partial(u, (1, 0))(x) + x[0], held), small()
+
+
 def small():
     return js.rectangle((0, 0), (1, 1), (12, 12), jitter=0.2)
 
@@ -229,7 +235,7 @@ ALONE = {
     "kernel": lambda: {"u": js.solve(*graded(), **weighted_kernel(graded()[1])).u},
     "factorize": lambda: {"u": js.factorize(heated(0.0, 0.0), small(), **CHEAP).solve(heated(2.0, 0.3)).u},
     "reacting": lambda: _in_time(reacting()[0], ramps, END, **reacting()[1]),
-    "drum": _drum,
+    "drum": _drum, "axis": lambda: {"u": js.solve(*axis(), **CHEAP).u},
 }  # fmt: skip
 
 
@@ -351,6 +357,7 @@ def once(found, one):
     found["kernel"] = off(jp.solve(problem, cloud, **weighted_kernel(cloud)), one["kernel"])
     sol = jp.solve(*system(), **CHEAP)
     found["system"], found["gathered"] = off(sol, one["system"]), np.shape(sol.gathered())
+    found["axis"] = off(jp.solve(*axis(), **CHEAP), one["axis"])
     found["cube"] = off(jp.solve(*cube(), **CHEAP), one["cube"])
     problem, cloud = of_params()
     value, slope = jp.value_and_grad(lambda u, x, k: (u**2).sum(), problem, cloud, **CHEAP)
@@ -412,6 +419,7 @@ def _refused(cloud):
         "mass": refused(lambda: jp.eigen(
             js.Problem(lambda u, x: jnp.stack([u(x)[1] - lap(u[0], x), lap(u[0], x)]), zero, fields=2), cloud, 1,
             mass=(0.0, 1.0), order=2)),
+        "axis": refused(lambda: jp.factorize(axis()[0], cloud, **CHEAP)),
         "array": refused(lambda: jp.solve(js.Problem(lap, {**zero, "top": js.dirichlet(np.zeros(3))}), cloud, **CHEAP)),
     }  # fmt: skip
 

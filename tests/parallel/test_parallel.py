@@ -69,7 +69,7 @@ def test_values_are_those_of_one_process(found):
 
 
 def test_so_they_are_by_other_solvers_methods_and_problems(of_two):
-    for name in ("values mumps", "kernel", "III", "system", "cube"):
+    for name in ("values mumps", "kernel", "III", "system", "cube", "axis"):
         assert of_two[name] < 1e-11, name
     assert of_two.get("values hypre", 0.0) < 1e-11
 
@@ -190,7 +190,8 @@ def test_hdf5(found):
         ("floating", "nothing fixes"), ("nonlinear", "nonlinear"), ("II", "'II' is none of"),
         ("periodic", "js.periodic is not made"), ("in time", "'radau' is none of"), ("a line", "in 1D"),
         ("first order", "information travels"), ("one process", "on process 0"), ("array", "shape (3,)"),
-        ("mass", "write the operator"), ("by params", "JAX transform"), ("by start", "JAX transform"),
+        ("mass", "write the operator"), ("axis", "lose their weight"),
+        ("by params", "JAX transform"), ("by start", "JAX transform"),
     ],
 )  # fmt: skip
 def test_what_is_not_made_is_refused_in_words(of_two, what, words):

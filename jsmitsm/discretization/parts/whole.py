@@ -17,6 +17,7 @@ class Part:
     is evenly spaced; spacing: the mean one of the whole. number (n,): of all particles here in the whole cloud of
     ``count``. every: of a step k every k-th particle of the whole; largest: of numbers by name the largest of all
     parts; total: the sum of an array over all parts; gather: what each part gives; all of them call these at once.
+    typical: what is typical of the equation in the whole (see ``degenerate.Typical``), where that was asked for.
     """
 
     own: np.ndarray
@@ -28,6 +29,7 @@ class Part:
     largest: Callable[[dict[Any, Any]], dict[Any, Any]]
     total: Callable[[Any], Any]
     gather: Callable[[Any], list[Any]]
+    typical: Any = None
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,7 @@ def pencil_of_part(
         taylor = None if start is None else start()
         with local.team.phase(local.halo.slab.number):
             nums = local.numbers(local.disc, taylor)
+            local.refuse_degenerate(nums.degenerate)
             layout, parts = laid_out(local.disc, nums, massed)
             pencil = pencil_of(layout, parts, nums)
         if not local.widen(local.team.most(max(_misses(local, layout), fits_miss(local, _sources(layout), degrees)))):
