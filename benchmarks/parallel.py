@@ -161,11 +161,11 @@ def solved(count: int, folder: str) -> dict[str, Any]:
 
 
 def keep(what: str, rows: list[dict[str, Any]]) -> None:
+    """Beside what was kept of others: of another number of parts or particles, or another solver."""
     data = json.loads(DATA.read_text()) if DATA.exists() else {}
-    data["machine"] = machine.describe()
-    key = "parts" if what == "parts" else "particles"
-    data[what] = sorted([r for r in data.get(what, []) if r[key] not in [x[key] for x in rows]] + rows,
-                        key=lambda r: r[key])  # fmt: skip
+    of = lambda row: (row["parts" if what == "parts" else "particles"], row.get("solver", ""))  # noqa: E731
+    rows = [row | {"machine": machine.describe()} for row in rows]
+    data[what] = sorted([row for row in data.get(what, []) if of(row) not in map(of, rows)] + rows, key=of)
     DATA.write_text(json.dumps(data, indent=1) + "\n")
 
 

@@ -81,6 +81,16 @@ def product(matrix: Any, x: np.ndarray) -> np.ndarray:
     return out.getArray().copy()
 
 
+def _add_turned_places(petsc: Any, matrix: Any) -> None:
+    """Zeros where the transpose has entries: GAMG adds the two, in place where these are the same."""
+    turned = matrix.transpose(petsc.Mat())
+    turned.zeroEntries()
+    matrix.axpy(1.0, turned, structure=petsc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
+    turned.destroy()
+    matrix.setOption(petsc.Mat.Option.STRUCTURALLY_SYMMETRIC, True)
+    give_back()
+
+
 class System:
     """The rows of all processes, unknowns numbered over all.
 
@@ -166,6 +176,8 @@ class System:
             prefix, options = f"jsmitsm_{way}_", self.petsc.Options()
             found = self.petsc.KSP().create(self.team.comm)
             found.setOptionsPrefix(prefix)
+            if way == "gamg":
+                _add_turned_places(self.petsc, matrix)
             found.setOperators(matrix)
             found.setTolerances(rtol=REDUCED, atol=0.0, max_it=MOST_STEPS)
             if way == "mumps":
@@ -181,6 +193,8 @@ class System:
                     options[f"{prefix}pc_hypre_boomeramg_{name}"] = value
             if way == "gamg":
                 options[f"{prefix}pc_gamg_threshold"] = _GAMG_THRESHOLD
+                # The square of the weights would be three times as large as these.
+                options[f"{prefix}pc_gamg_aggressive_square_graph"] = False
             found.setFromOptions()
             found.setErrorIfNotConverged(False)
             self._solvers[way, transpose] = found
