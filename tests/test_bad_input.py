@@ -417,6 +417,13 @@ EVALUATION = [
     ("picture-field", evaluate(lambda sol: js.plot.solution(sol, field=1)), "field:", "one field 0"),
     ("picture-exact", evaluate(lambda sol: js.plot.solution(sol, exact=3.0)), "exact:", "function of one point"),
     ("picture-log", lambda: js.plot.values(LINE, np.ones(9), log="no"), "log:", "True or False"),
+    ("picture-colorbar", lambda: js.plot.values(SQUARE, np.ones(25), colorbar="no"), "colorbar:", "True or False"),
+    ("picture-levels", lambda: js.plot.values(SQUARE, np.ones(25), levels=10**400), "levels:", "such as 20"),
+    ("picture-names", evaluate(lambda sol: js.plot.fields(sol, names=3)), "names:", "in a list"),
+    ("picture-exact-fails", evaluate(lambda sol: js.plot.error(sol, lambda: 1.0)), "exact:", "one point x"),
+    ("tuned", lambda: js.tune(js.Problem(poisson, ENDS), LINE, KERNEL, parameters=3), "parameters:", "'h', 'd', in a"),
+    ("tuned-from", lambda: js.tune(js.Problem(poisson, ENDS), LINE, KERNEL, u0="a"), "u0:", "a function of x"),
+    ("stages", lambda: js.continuation(lambda: None, LINE, [1.0, 2.0]), "problem:", "the parameter alone"),
     ("flat", evaluate(lambda s: s(np.zeros(3))), "points:", r"\(M, 1\)"),
     ("scalar", evaluate(lambda s: s(0.5)), "points:", r"\(M, 1\)"),
     ("dimension", evaluate(lambda s: s(np.zeros((3, 2)))), "points:", r"\(M, 1\)"),
@@ -620,3 +627,26 @@ def test_fields_of_a_system_left_out():
     pde = lambda u, x: [js.laplacian(u)(x)[0] - u(x)[1], js.laplacian(u)(x)[1]]
     with pytest.raises(ValueError, match=r"pde: .*fields=F"):
         js.solve(js.Problem(pde, {"left": js.dirichlet(0.0), "right": js.dirichlet(0.0)}), js.interval(0.0, 1.0, 9))
+
+
+@pytest.mark.parametrize(
+    "call, words",
+    [(lambda: js.solve(js.Problem(poisson, ENDS), LINE, oder=6), "oder: no argument of solve; did you mean 'order'"),
+     (lambda: js.continuation(lambda k: js.Problem(poisson, ENDS), LINE, [1.0, 2.0], oder=6), "did you mean 'order'"),
+     (lambda: js.Problem(poisson, bc=ENDS), "bc: no argument of Problem; did you mean 'bcs'"),
+     (lambda: js.stencils(LINE, sise=5), "sise: .*it takes cloud, size, radius"),
+     (lambda: js.SuperGaussian(d=3.0), "SuperGaussian: missing a required argument: 'h'; it takes h, d"),
+     (lambda: js.dirichlet(1.0, 0, 3), "dirichlet: too many positional arguments; it takes value, field")],
+)  # fmt: skip
+def test_arguments_that_a_function_does_not_have(call, words):
+    with pytest.raises(TypeError, match=words):
+        call()
+
+
+def test_the_users_own_wrong_call_is_left_as_it_is():
+    with pytest.raises((TypeError, ValueError), match="theirs"):
+        js.solve(js.Problem(lambda u, x: theirs(1, 2, 3), ENDS), LINE)
+
+
+def theirs(a):
+    return a

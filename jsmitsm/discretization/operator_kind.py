@@ -87,6 +87,34 @@ def turned(disc: Discretization, nums: Numbers) -> np.ndarray:
     return min(above, below, key=lambda some: told.total(len(some)))
 
 
+def inward_growth(disc: Discretization, nums: Numbers) -> tuple[np.ndarray, np.ndarray]:
+    """Held particles of a first-order equation, and from each the exponent of growth to the next particle inside.
+
+    Along its characteristics u grows or falls as exp(-c s), c the coefficient of u over the speed. Where values are
+    given at the end to which things flow, what falls along the flow grows inwards.
+    """
+    rec = disc.rec
+    along, zero = _first(rec), next((s for s, (_, b) in enumerate(rec.slots) if sum(b) == 0), None)
+    held = np.flatnonzero(disc.held.all(axis=1) & ~np.isin(np.arange(len(disc.cloud)), nums.ids))
+    if rec.fields > 1 or set(rec.orders) != {1} or zero is None or not len(held) or not len(nums.ids):
+        return held[:0], np.zeros(0)
+    points = np.asarray(disc.cloud.points, float)
+    from scipy.spatial import cKDTree
+
+    inside = cKDTree(points[nums.ids]).query(points[held])[1]
+    jac = np.broadcast_to(np.asarray(nums.jac)[0, :, 0], (len(rec.slots), len(nums.ids)))[:, inside]
+    flow = np.stack([np.zeros(len(held)) if slot is None else jac[slot] for slot in along], axis=1)
+    speed, way = np.linalg.norm(flow, axis=1), points[nums.ids[inside]] - points[held]
+    rate = -np.sign(np.einsum("nd,nd->n", flow, way)) * jac[zero] / np.where(speed > 0, speed, np.inf)
+    return held, rate * np.linalg.norm(way, axis=1)
+
+
+def _first(rec: Recursion) -> list[int | None]:
+    """The places of the first derivatives along every axis among the coefficients."""
+    places = {b.index(1): s for s, (_, b) in enumerate(rec.slots) if sum(b) == 1}
+    return [places.get(axis) for axis in range(rec.dim)]
+
+
 def _timelike(rec: Recursion) -> bool:
     """Whether an axis enters by a first derivative only, as time does in a heat equation."""
     second = {axis for _, b in rec.slots if sum(b) == 2 for axis in range(rec.dim) if b[axis]}

@@ -8,7 +8,7 @@ import numpy as np
 
 from jsmitsm.parallel.halo import from_box
 from jsmitsm.parallel.local import OfOwn
-from jsmitsm.parallel.look.flags import kinks, told
+from jsmitsm.parallel.look.flags import told, unseen
 from jsmitsm.parallel.look.towards import corrected
 from jsmitsm.parallel.team import Team, team
 from jsmitsm.runtime.arrays import ArrayLike
@@ -90,8 +90,8 @@ class ParallelSolution(OfOwn):
         """The size of the estimated error (n, F) of the own values."""
         if self._error is None:
             towards, units = corrected(self._local, self._values, self._linearised)
-            beyond = kinks(self._local, self.system, self._values, self._linearised)
-            self._error = np.abs(towards) if beyond is None else np.maximum(np.abs(towards), beyond)
+            beyond = unseen(self._local, self.system, self._values, self._linearised)
+            self._error = np.maximum(np.abs(towards), beyond)
             own = self._values[self._local.halo.ids]
             self._share = share(self._error * units, own * units, told=self._local.whole)
         return self._error

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import functools
+import inspect
 import math
 import re
 import sys
@@ -24,6 +25,7 @@ SYMPTOMS = {
     "The global system is nearly singular": "singular",
     "Round-off may reach": "round-off",
     "contradict the equation": "contradiction",
+    "grows inwards": "growth",
     "The part of the source": "source",
     "The coefficients of the operator change": "coefficients",
     "A coefficient of the highest derivatives jumps": "jumps",
@@ -145,7 +147,11 @@ class _Explaining:
         @functools.wraps(function)
         def explained(*args: Any, **options: Any) -> Any:
             with self, _ranks_promoted():
-                return function(*args, **options)
+                try:
+                    return function(*args, **options)
+                except TypeError:
+                    _refuse_call(function, args, options)
+                    raise
 
         return explained  # type: ignore[return-value]
 
@@ -158,6 +164,19 @@ class _Explaining:
 
 
 explaining = _Explaining()
+
+
+def _refuse_call(function: Callable[..., Any], args: tuple[Any, ...], options: dict[str, Any]) -> None:
+    """Refuse in words arguments that a function has not, or lacks; nothing where it can be called so."""
+    signature = inspect.signature(function)
+    try:
+        signature.bind(*args, **options)
+    except TypeError as fault:
+        name = type(args[0]).__name__ if function.__name__ == "__init__" else function.__qualname__
+        known = [p.name for p in signature.parameters.values() if p.name != "self" and p.kind != p.VAR_KEYWORD]
+        alien = next((option for option in options if option not in known), None)
+        wrong = f"{name}: {fault}" if alien is None else f"{alien}: no argument of {name}{did_you_mean(alien, known)}"
+        raise TypeError(f"{wrong}; it takes {', '.join(known) or 'nothing'}") from None
 
 
 def _ranks_promoted() -> AbstractContextManager[Any]:

@@ -11,7 +11,7 @@ import numpy as np
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.cloud.neighbours import Stencils, within
 from jsmitsm.particle.kernels import Kernel
-from jsmitsm.runtime.errors import is_number, is_whole, short
+from jsmitsm.runtime.errors import IN_FUNCTIONS, in_words, is_number, is_whole, refuse_no_switch, short
 from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.show.pieces import AXES, Piece, clipped, pieces
 from jsmitsm.solution.solution import Solution
@@ -142,9 +142,14 @@ def at_points(function: Callable, points: np.ndarray) -> np.ndarray:
     if not callable(function):
         raise ValueError(f"exact: expected a function of one point x, got {short(function)}")
     try:
-        return np.asarray(jax.vmap(function)(points), dtype=float)
-    except jax.errors.JAXTypeError:
-        return np.array([function(x) for x in points], dtype=float)
+        try:
+            return np.asarray(jax.vmap(function)(points), dtype=float)
+        except jax.errors.JAXTypeError:
+            return np.array([function(x) for x in points], dtype=float)
+    except IN_FUNCTIONS as error:
+        raise ValueError(
+            f"exact: expected a function of one point x that returns a number, this one fails: {in_words(error)}"
+        ) from error
 
 
 def floor(numbers: np.ndarray) -> float:
@@ -251,8 +256,9 @@ def maps(cloud: Cloud, numbers: np.ndarray, anywhere: Callable | None, at: Mappi
     """Filled contours of a 2D cloud, or of slices through a 3D one, all on one scale."""
     from matplotlib.ticker import FuncFormatter, MaxNLocator
 
-    if not is_whole(levels, 0):
-        raise ValueError(f"levels: expected a number of contour levels, such as 20, got {levels!r}")
+    if not is_whole(levels, 0, 10_000):
+        raise ValueError(f"levels: expected a number of contour levels, such as 20, got {short(levels)}")
+    refuse_no_switch("colorbar", colorbar)
     if not np.isfinite(numbers).all():
         raise ValueError("sol: has values that are not finite, and did not converge; see sol.diagnose()")
 

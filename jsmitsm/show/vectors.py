@@ -11,7 +11,7 @@ import numpy as np
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.cloud.regions.region_cloud import RegionCloud
 from jsmitsm.cloud.triangulation import boundary_facets
-from jsmitsm.runtime.errors import explaining, is_whole
+from jsmitsm.runtime.errors import explaining, is_whole, listed, short
 from jsmitsm.show import drawing
 from jsmitsm.show.drawing import COLOURS
 from jsmitsm.show.pieces import Piece, clipped, outline, pieces
@@ -378,6 +378,6 @@ def names_of(given: Sequence[str] | None, count: int) -> Sequence[str]:
     """One name for every field."""
     if given is None:
         return [f"u[{k}]" for k in range(count)]
-    if isinstance(given, str) or len(given) != count:
-        raise ValueError(f"names: expected {count}, one for every field, got {given!r}")
-    return given
+    if isinstance(given, str) or len(names := listed("names", given, f"{count} texts")) != count:
+        raise ValueError(f"names: expected {count}, one for every field, got {short(given)}")
+    return [str(name) for name in names]

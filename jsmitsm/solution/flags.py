@@ -4,7 +4,7 @@ None of the tests costs a moment system: some solves with the kept factors and s
 They clear what is linear, of one field and far from their bounds. Everywhere else the error estimate
 (``js.Solution.error_estimate``) is asked, which costs another assembly of a higher order, and decides: it clears
 what was only suspected, and is a flag itself where it is large. What no particle sees it does not see either, and
-is looked for by itself (``jsmitsm.solution.look.between``). A healthy solution has no flags. A flag is no proof of an
+is looked for by itself (``jsmitsm.solution.look``). A healthy solution has no flags. A flag is no proof of an
 error, nor its absence one of accuracy.
 """
 
@@ -12,21 +12,29 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cache
 from typing import Any
 
 import numpy as np
 
 from jsmitsm.discretization.health import LEBESGUE
 from jsmitsm.discretization.leave_one_out import right_side
-from jsmitsm.discretization.operator_kind import cell_peclet, mean_spacing, turned, usual_condition, wave_number
+from jsmitsm.discretization.operator_kind import (
+    cell_peclet,
+    inward_growth,
+    mean_spacing,
+    turned,
+    usual_condition,
+    wave_number,
+)
 from jsmitsm.discretization.parts.whole import particles, whole
 from jsmitsm.discretization.resolution.contradictions import contradictions
-from jsmitsm.discretization.resolution.steepness import steepness, unseen
+from jsmitsm.discretization.resolution.steepness import steepness
+from jsmitsm.discretization.resolution.steepness import unseen as beyond_slopes
 from jsmitsm.discretization.rows import all_rows
 from jsmitsm.runtime.errors import some
-from jsmitsm.solution.look.between import between, beyond_kinks, even, out_of_reach, seam, unseen_data
+from jsmitsm.solution.look.between import beyond_kinks
 from jsmitsm.solution.look.sizes import predicted, scales, share
+from jsmitsm.solution.look.told import CLEARED, data, out_of_reach, unseen
 
 # A particle may differ from the linear function through its neighbours by this part of the
 # range; a sine of six particles a wavelength differs by 0.25. By order: up to 3, and above.
@@ -57,16 +65,16 @@ ROUNDED = 1e-3
 PHASE = (0.9, 3.5)
 
 
-# An estimated error below this part of the solution clears what only suspects the resolution ...
-CLEARED = 0.02
-# ... unless what is missed between the particles would make so much of the solution, or where the source says so too.
-MISSED, AGREED = 1.0, 0.3
-# ... or boundary data so much: seven particles a wavelength leave an eighth of the data.
-DATA = 0.3
-# ... or values that no polynomial reaches: above 0.27 where estimates were blind, below 0.05 of solutions right to 1 %.
-REACHED = 0.2
 # Where the highest derivatives change their sign, a smooth solution has a smaller estimated error than this.
 TURNED = 1e-3
+# Waves of so few particles that their phase would be out so many times as far as is a doubt are in truth where two
+# orders agree to this.
+SHORT, LOST_PHASE = 10.0, 5e-3
+# Growth from a held value to the next particle, as an exponent: from 0.75 on values were forgotten, and from 1.0 on no
+# estimate knew.
+GROWN = 0.8
+# Two orders whose solutions agree to this part of what their local fits miss have missed the same.
+BLINDLY = 0.03
 # Measures below these clear a solution without an estimate, but for kinks. Of 250 random linear problems they cleared
 # 53, all of them right to 0.3 %; at three times these a beam was wrong by 17 %.
 CLEAR = {"roughness": 0.05, "source": 0.01, "excess": 10.0, "coefficient": 0.1}
@@ -94,7 +102,7 @@ def flags(run: Any, values: Any, nums: Any, estimated: Callable[[], float]) -> t
     if told.total(int(not np.isfinite(told.own(values)).all())):
         return ["The values are not finite."], {}
     certain, doubts, found = list[str](), list[str](), dict[str, float]()
-    for test in (_round_off, _far_away, _jumps, _contradictions):
+    for test in (_round_off, _far_away, _jumps, _contradictions, _growth):
         test(run, values, nums, certain, found)
     for test in DOUBTS:
         test(run, values, nums, doubts, found)
@@ -109,46 +117,19 @@ def flags(run: Any, values: Any, nums: Any, estimated: Callable[[], float]) -> t
     cleared = _cleared(run, values, found, doubts)
     if not cleared:
         found["estimate"] = estimated()
-        if found["estimate"] > (TURNED if found.get("turned") else CLEARED):
-            return doubts, found
+        least, most = _clearing(found, run.disc.rec.order)
+        if not least <= found["estimate"] <= most:
+            return [*doubts, *out_of_reach(run, values, found), *data(run, values, found)], found
     # Near a resonance any residual grows without bound, that of the truncation too; the estimate has its signs.
-    return [] if singular else _unseen(run, values, found, cleared), found
+    return [] if singular else unseen(run, values, found, cleared, found.get("source", 0.0) > SOURCE), found
 
 
-def _unseen(run: Any, values: np.ndarray, found: dict[str, float], cleared: bool) -> list[str]:
-    """What no particle sees, and with them no estimate: between them, and beyond a seam; cleared: by cheap tests."""
-    every, fitted = whole(run.disc), cache(lambda: run.fitted(run.nums, values))
-    part = lambda missed: share(every.own(missed), every.own(values), told=every)
-    found["missed"] = missed = 0.0 if cleared and even(run) else part(between(run, fitted))
-    found["data"] = data = part(unseen_data(run))
-    found["seam"] = beyond = part(seam(run, values))
-    told = []
-    # Constant coefficients degenerate nowhere, and layers that fall to nothing within the spacing may be right.
-    if not (run.disc.linear and run.disc.traced.constant):
-        unmet, at = out_of_reach(run, values, fitted)
-        found["unmet"], at = part(unmet), every.named(at)
-        if found["unmet"] > REACHED:
-            told.append(
-                f"The local polynomials of {len(at)} particle(s), first {some(at)}, do not reach their nearest "
-                f"neighbours, which makes {found['unmet']:.0%} of the solution, and no order sees it: beside a "
-                "singular point, or in a layer thinner than the spacing; refine there."
-            )
-    if missed > (AGREED if found.get("source", 0.0) > SOURCE else MISSED):
-        told.append(
-            f"Between the particles the equation is missed by as much as makes {missed:.0%} of the solution: the "
-            "source or a coefficient changes within the spacing, unseen by the particles; refine there, or smooth it."
-        )
-    if data > DATA:
-        told.append(
-            f"Between the particles boundary data change by as much as makes {data:.0%} of the solution, unseen by "
-            "them: refine the boundary, or smooth the data."
-        )
-    if beyond > CLEARED:
-        told.append(
-            f"The equation is not the same on both sides of a periodic pair, which makes {beyond:.0%} of the solution: "
-            "let the source and the coefficients repeat themselves, or refine there."
-        )
-    return told
+def _clearing(found: dict[str, float], order: int) -> tuple[float, float]:
+    """The least and the largest estimated error that clear a solution of its doubts."""
+    least = BLINDLY * found.get("misfit", 0.0) if found.get("misfit", 0.0) > MISFIT else 0.0
+    if found.get("turned"):
+        return least, TURNED
+    return least, LOST_PHASE if found.get("wave", 0.0) > SHORT * PHASE[order > 3] else CLEARED
 
 
 def _turned(run: Any, values: np.ndarray, nums: Any, out: list[str], found: dict[str, float]) -> None:
@@ -285,7 +266,7 @@ def _coefficients(run: Any, values: np.ndarray, nums: Any, out: list[str], found
 def _jumps(run: Any, values: np.ndarray, nums: Any, out: list[str], found: dict[str, float]) -> None:
     if np.shape(nums.jac)[-1] == 1:
         return
-    lost = unseen(run.disc, nums, run.problem, lambda: run.fitted(nums, values))
+    lost = beyond_slopes(run.disc, nums, run.problem, lambda: run.fitted(nums, values))
     bad = whole(run.disc).named(np.flatnonzero(lost))
     found["jumps"] = len(bad)
     if len(bad):
@@ -308,6 +289,20 @@ def _contradictions(run: Any, values: np.ndarray, nums: Any, out: list[str], fou
             f"The values held at {len(bad)} particle(s), first {some(bad)}, contradict the equation, whose highest "
             "derivatives have no weight there and which fixes u, or its slope, by itself: correct them, or give "
             "js.free() where the equation needs no condition."
+        )
+
+
+def _growth(run: Any, values: np.ndarray, nums: Any, out: list[str], found: dict[str, float]) -> None:
+    if run.formulation != "lsq":
+        return
+    held, exponent = inward_growth(run.disc, nums)
+    found["growth"] = float(exponent.max(initial=0.0))
+    bad = held[exponent > GROWN]
+    if len(bad):
+        out.append(
+            f"From {len(bad)} held value(s), first {some(bad)}, the solution grows inwards, by a factor of "
+            f"{np.exp(found['growth']):.1f} to the next particle: least squares would rather forget such a value; give "
+            "it where the equation carries it in, or refine."
         )
 
 

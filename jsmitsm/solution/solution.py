@@ -18,7 +18,7 @@ from jsmitsm.solution.anywhere import Anywhere
 from jsmitsm.solution.estimate import Correction, correction
 from jsmitsm.solution.fit import Recipe
 from jsmitsm.solution.flags import SQUARED, too_large
-from jsmitsm.solution.look.between import beyond_kinks
+from jsmitsm.solution.look.reach import beyond_orders
 from jsmitsm.solution.look.sizes import NOTHING, share
 from jsmitsm.solution.run import Run
 
@@ -126,8 +126,8 @@ class Solution(Anywhere):
         """Estimated error |u - u_exact| at every particle: what leads to the solution of order p + 2.
 
         Computed when asked for: one more assembly at order p + 2 and one more solve. Where rows of that order are weak,
-        and in the least-squares form, a lower order is asked too. Where a linear problem has kinks or jumps, which no
-        order sees, what they make of the solution is measured beside.
+        and in the least-squares form, a lower order is asked too. What no order sees is measured beside: kinks and
+        jumps, and values that the local polynomials around do not reach, as beside a singular point.
 
         Returns
         -------
@@ -155,19 +155,23 @@ class Solution(Anywhere):
         if self._fit is None:
             raise ValueError("error_estimate: this solution was pickled without its problem; ask before pickling")
         own = getattr(self._fit, "error_estimate", None)  # one of several regions brings its own
-        return self._kept(own(self._values)) if own else self._size(self._corrected())
+        if own:
+            return self._size(own(self._values).reshape(jnp.shape(self._values)))
+        found = self._corrected()
+        return self._size(abs(found.error), found.units)
 
     def _corrected(self) -> Correction:
         """The estimate, with the rows of the solve where they are still there."""
         return correction(self._fit, self._values, self._report if isinstance(self._report, Run) else None)
 
-    def _size(self, found: Correction) -> Array:
-        """The size of an estimated error, kept for the next who asks."""
-        error = abs(found.error)
+    def _size(self, error: Any, units: Any = 1.0) -> Array:
+        """The size of an estimated error (N, F), no less than what no order sees, kept for the next who asks."""
         if isinstance(self._report, Run) and not is_traced(error, self._values):
-            beyond = beyond_kinks(self._report, self._values)
-            error = error if beyond is None else np.maximum(error, beyond)
-        return self._kept(error[..., 0] if self._recipe.fields == 1 else error, found.units)
+            error = np.maximum(error, self._beyond(np.asarray(self._values, float)))
+        return self._kept(error[..., 0] if self._recipe.fields == 1 else error, units)
+
+    def _beyond(self, values: np.ndarray) -> np.ndarray:
+        return beyond_orders(self._report, values)
 
     def _kept(self, error: Array, units: Any = 1.0) -> Array:
         if not is_traced(error, self._values):
@@ -216,7 +220,7 @@ class Solution(Anywhere):
         if not self.defects:
             raise ValueError("correction: several regions have an error estimate, but no defects to refine by")
         found = self._corrected()
-        self._size(found)
+        self._size(abs(found.error), found.units)
         return found
 
     def _estimated(self) -> float:

@@ -20,7 +20,7 @@ from jsmitsm.equation.problem import Problem
 from jsmitsm.particle.kernels import Kernel
 from jsmitsm.runtime import notebooks
 from jsmitsm.runtime.arrays import ArrayLike, ValueOrFunction
-from jsmitsm.runtime.errors import did_you_mean, explaining, is_one_of, is_whole, short
+from jsmitsm.runtime.errors import did_you_mean, explaining, is_one_of, is_whole, listed, short
 from jsmitsm.runtime.progress import bar
 from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.solution.arguments import SolveOptions, check, discretized
@@ -198,13 +198,14 @@ def _chosen(problem: Problem, cloud: Cloud, options: dict[str, Any]) -> Kernel:
 
 
 def _checked_names(kernel: Kernel, parameters: Any) -> tuple[str, ...]:
-    names = (parameters,) if isinstance(parameters, str) else tuple(parameters)
     known = ["h", "d"] + (["params"] if jax.tree.leaves(kernel.params) else [])
+    some = [parameters] if isinstance(parameters, str) else parameters
+    names = tuple(listed("parameters", some, f"some of {', '.join(map(repr, known))}"))
     for name in names:
-        if name not in known:
+        if not is_one_of(name, known):
             raise ValueError(
-                f"parameters: {name!r} is no parameter of {type(kernel).__name__}; it has {', '.join(map(repr, known))}"
-                + did_you_mean(name, known)
+                f"parameters: {short(name)} is no parameter of {type(kernel).__name__}; it has "
+                f"{', '.join(map(repr, known))}" + did_you_mean(name, known)
             )
     if not names or len(set(names)) < len(names):
         raise ValueError(f"parameters: expected some of {', '.join(map(repr, known))}, each once, got {parameters!r}")
@@ -218,7 +219,7 @@ def _check_input(problem, cloud, kernel, objective, optimizer, steps, options) -
                              + did_you_mean(name, [*OPTIONS, "objective", "optimizer", "steps"]))  # fmt: skip
     o = {"formulation": "auto", "solver": "auto", "stencils": None, **options}
     check(problem, cloud, o["method"], o["order"], kernel, o["stencils"], o["formulation"], o["solver"],
-          depth=o.get("depth", "auto"))
+          u0=o.get("u0"), throw=o.get("throw", True), depth=o.get("depth", "auto"))
     if is_traced(kernel, cloud, problem.params):
         raise ValueError("kernel, cloud, problem: traced by a JAX transform; js.tune runs on the host, call it outside")
     if not is_one_of(objective, ["estimate"]) and not callable(objective):

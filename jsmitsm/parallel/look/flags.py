@@ -15,7 +15,7 @@ from jsmitsm.parallel.look.conditioning import condition
 from jsmitsm.parallel.system import ROUND_OFF, System
 from jsmitsm.runtime.errors import SolveError
 from jsmitsm.solution.flags import flags
-from jsmitsm.solution.look.between import beyond_kinks, has_kinks
+from jsmitsm.solution.look.reach import beyond_orders
 
 
 class Factor:
@@ -60,15 +60,12 @@ class Look:
         return self.local.halo.spread(np.asarray(with_held_expansions(self.disc, self.fitted(nums, values))))
 
 
-def kinks(local: Local, system: System, values: np.ndarray, taylor: Any) -> np.ndarray | None:
-    """What no order sees beyond kinks and jumps, at the own particles (n, F); None where there are none."""
-    if not has_kinks(local.disc):
-        return None
+def unseen(local: Local, system: System, values: np.ndarray, taylor: Any) -> np.ndarray:
+    """What no order sees, at the own particles (n, F)."""
     with local.team.phase(local.halo.slab.number):
         look = Look(local, system, taylor)
     with local.team.phase():
-        found = beyond_kinks(look, values)
-    return None if found is None else found[local.halo.ids]
+        return beyond_orders(look, values)[local.halo.ids]
 
 
 def told(

@@ -1,8 +1,7 @@
 """What the particles do not see of a problem, and what it would make of the solution.
 
-Between them the residual that the local polynomials leave, where nothing made it small, boundary data, and values that
-no polynomial reaches; beyond a kink or a jump what the series of one side leave out, beyond a periodic seam the
-equation on its other side.
+Between them the residual that the local polynomials leave, where nothing made it small, and boundary data; beyond a
+kink or a jump what the series of one side leave out, beyond a periodic seam the equation on its other side.
 """
 
 from __future__ import annotations
@@ -31,11 +30,11 @@ NEAR, ASIDE = 1.5, 0.5
 # A coefficient or a source halfway is even where it differs from the mean of both ends by less than this part of them,
 # or of so small a part of the largest anywhere: ten particles a wavelength leave 0.05.
 UNEVEN, SMALL = 0.2, 0.01
+# On the way to a neighbour one looks at these parts of it, by dimension; from both ends they are nearly twice as many.
+WAYS = {1: (0.5, 0.11, 0.21, 0.31, 0.41), 2: (0.5, 0.25), 3: (0.5,)}
 # A series ends at a kink where it misses what is halfway to a neighbour by so many times its last two degrees there,
 # and by more than this part of what is there.
 ENDED, FAINT = 3.0, 1e-6
-# A polynomial does not reach its neighbours where it misses one by this part of the largest change to any of them.
-LOST = 0.2
 
 
 def between(run: Any, fitted: Callable[[], np.ndarray]) -> np.ndarray:
@@ -65,35 +64,6 @@ def beyond_kinks(run: Any, values: Any) -> np.ndarray | None:
         return None
     left_out = out_of_series(disc, nums, run.problem, run.fitted(nums, values))
     return _made_of(run, left_out) if whole(disc).total(int(np.any(left_out.source))) else None
-
-
-def out_of_reach(run: Any, values: np.ndarray, fitted: Callable[[], np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """What values that neighbours' polynomials miss make of the solution (N, F), and whose polynomials these are.
-
-    Beside a singular point, as where a well is thinner than the spacing, and where held values have no part in the
-    solution, the series of all orders end alike, and no estimate sees it. Polynomials that reach their nearest
-    neighbours, however well, are taken for right: what they miss is the estimate's. Nothing in the least-squares form,
-    which has a misfit of its own.
-    """
-    disc, zero = run.disc, np.zeros(run.disc.held.shape)
-    if run.formulation == "lsq":
-        return zero, np.zeros(0, int)
-    points, u, missed = np.asarray(disc.points, float), fitted(), zero.copy()
-    powers = np.array(multi_indices(disc.rec.dim, disc.rec.reach))[: u.shape[2]]
-    for cls in disc.classes:
-        own, total, most, change = values[cls.ids], *(np.zeros((len(cls.ids), u.shape[1])) for _ in range(3))
-        near = np.asarray(cls.neighbours)[:, 1 : 1 + 2 * disc.rec.dim]
-        for other in np.where(near >= 0, near, cls.ids[:, None]).T:
-            there = values[np.asarray(disc.images.owners(other))]
-            terms = np.prod((points[other] - points[cls.ids])[:, None] ** powers, axis=2)
-            off = np.where((other != cls.ids)[:, None], np.abs(np.einsum("nfk,nk->nf", u[cls.ids], terms) - there), 0.0)
-            total, most, change = total + off, np.maximum(most, off), np.maximum(change, np.abs(there - own))
-        missed[cls.ids] = np.where(most > LOST * change, total / max(near.shape[1], 1), 0.0)
-    free, told = ~disc.held if disc.part is None else ~disc.held & disc.part.own[:, None], whole(disc)
-    most = told.most((missed * free).max(axis=0, initial=0.0))
-    if not np.any(most):
-        return zero, np.zeros(0, int)
-    return solved_alone(run, missed[free]), np.flatnonzero((free & (missed > LOST * most)).any(axis=1))
 
 
 def has_kinks(disc: Discretization) -> bool:
@@ -143,7 +113,7 @@ def _left_out(
 
 
 def even(run: Any) -> bool:
-    """Whether source and coefficients of a linear problem are halfway to the neighbours what they are on both ends.
+    """Whether source and coefficients of a linear problem are on the way to the neighbours what they are on both ends.
 
     A look without polynomials: where it sees nothing, there is no need of theirs.
     """
@@ -165,16 +135,27 @@ def even(run: Any) -> bool:
             if uneven:
                 break
             ids, to = cls.ids[other >= 0], other[other >= 0]
-            there, ends = at(0.5 * (points[ids] + points[to])), (known[:, :, ids], known[:, :, to])
+            ends = known[:, :, ids], known[:, :, to]
             size = np.maximum(np.maximum(*map(np.abs, ends)), SMALL * largest)
-            uneven = bool((np.abs(there - 0.5 * (ends[0] + ends[1])) > UNEVEN * size).any())
+            for part in WAYS[disc.rec.dim]:
+                away = at((1.0 - part) * points[ids] + part * points[to]) - (1.0 - part) * ends[0] - part * ends[1]
+                uneven |= bool((np.abs(away) > UNEVEN * size).any())
     return not told.most(float(uneven))
 
 
 def _looked_at(disc: Discretization, cls: Class) -> np.ndarray:
-    """The neighbours (n, k) halfway to which one looks: on a lattice those along its axes and across its cells."""
+    """The neighbours (n, k) on the way to which one looks: on a lattice those along its axes and across its cells."""
     dim = disc.rec.dim
-    return np.asarray(cls.neighbours)[:, 1 : 1 + 2 * dim + (2**dim if dim > 1 else 0)]
+    return nearest_of(disc, cls, 2 * dim + (2**dim if dim > 1 else 0))
+
+
+def nearest_of(disc: Discretization, cls: Class, count: int) -> np.ndarray:
+    """The nearest neighbours (n, k) of the particles of a class, -1 where there are fewer; stencils need no order."""
+    near, points = np.asarray(cls.neighbours), np.asarray(disc.points, float)
+    there = (near >= 0) & (near != cls.ids[:, None])
+    square = np.square(points[np.where(there, near, 0)] - points[cls.ids][:, None]).sum(axis=2)
+    first = np.argsort(np.where(there, square, np.inf), axis=1, kind="stable")[:, :count]
+    return np.where(np.take_along_axis(there, first, axis=1), np.take_along_axis(near, first, axis=1), -1)
 
 
 def unseen_data(run: Any) -> np.ndarray:
@@ -294,7 +275,7 @@ def solved_alone(run: Any, right: np.ndarray) -> np.ndarray:
 def unresolved(disc: Discretization, nums: Numbers, problem: Problem, fitted: np.ndarray) -> Numbers:
     """The numbers of the same operator with, for its source, what the polynomials leave of the residual.
 
-    fitted (N, F, K): these polynomials. The residual is looked at halfway to the nearest neighbours, and averaged: a
+    fitted (N, F, K): these polynomials. The residual is looked at on the way to the nearest neighbours, and averaged: a
     source or a coefficient that the particles do not see, or whose Taylor series ends before it reaches the neighbours,
     shows there.
     """
@@ -361,16 +342,23 @@ def _source_left_out(disc: Discretization, nums: Numbers, problem: Problem, rows
 def _mean(disc: Discretization, problem: Problem, cls: Class, points: np.ndarray, fitted: np.ndarray) -> np.ndarray:
     """The mean residual (E, n) around every particle of a class, whose own share of it is zero."""
     left = lambda at, offset: residual(disc, problem, at, offset, fitted[cls.ids])
-    return _around(disc, cls, points, left)
+    return _around(disc, cls, points, left, WAYS[disc.rec.dim])
 
 
-def _around(disc: Discretization, cls: Class, points: np.ndarray, left: Callable[..., Any]) -> np.ndarray:
-    """The mean (E, n) of something that vanishes at the particles of a class and is left(points, offsets) halfway."""
+def _around(
+    disc: Discretization, cls: Class, points: np.ndarray, left: Callable[..., Any], ways: tuple[float, ...] = (0.5,)
+) -> np.ndarray:  # fmt: skip
+    """The mean (E, n) of something that vanishes at the particles of a class and is left(points, offsets) halfway.
+
+    ways: the parts of the way to a neighbour at which one looks, and takes what is largest.
+    """
     near = _looked_at(disc, cls)
     total, count = np.zeros((len(disc.rec.orders), len(cls.ids))), np.ones(len(cls.ids))
     for k in range(near.shape[1]):
         there = near[:, k] >= 0
-        offset = 0.5 * (points[np.where(there, near[:, k], cls.ids)] - points[cls.ids])
-        total += np.where(there, left(points[cls.ids] + offset, offset), 0.0)
+        way = points[np.where(there, near[:, k], cls.ids)] - points[cls.ids]
+        found = np.stack([left(points[cls.ids] + part * way, part * way) for part in ways])
+        found = np.take_along_axis(found, np.abs(found).argmax(axis=0)[None], axis=0)[0]
+        total += np.where(there, found, 0.0)
         count += there
     return total / count

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Sequence
 from typing import Any, Literal, Unpack, overload
 
@@ -117,6 +118,14 @@ def continuation(
         raise ValueError(
             f"problem: expected a function of the parameter that returns a js.Problem, got {type(problem).__name__}"
         )
+    try:
+        inspect.signature(problem).bind(0.0)
+    except TypeError as fault:
+        raise ValueError(
+            f"problem: expected a function of the parameter alone, and it cannot be called so: {fault}"
+        ) from None
+    except ValueError:  # one of C's, which has no signature
+        pass
     refuse_no_switch("arclength", arclength)
     options["throw"] = True
     if arclength:

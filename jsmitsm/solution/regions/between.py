@@ -10,7 +10,6 @@ import numpy as np
 from jsmitsm.discretization.coefficients import Numbers
 from jsmitsm.discretization.regions.layout import Part
 from jsmitsm.discretization.regions.rows import RegionNumbers, spread, whole_coefficients, whole_right_side
-from jsmitsm.solution.flags import CLEARED, DATA, MISSED
 from jsmitsm.solution.look.between import (
     data_between,
     has_kinks,
@@ -20,7 +19,9 @@ from jsmitsm.solution.look.between import (
     unresolved,
     with_source,
 )
+from jsmitsm.solution.look.reach import LOST, TIMES, made_of, missed
 from jsmitsm.solution.look.sizes import share
+from jsmitsm.solution.look.told import CLEARED, DATA, MISSED
 
 
 def unseen(run: Any, values: np.ndarray) -> list[str]:
@@ -36,9 +37,9 @@ def unseen(run: Any, values: np.ndarray) -> list[str]:
         return out_of_series(disc, own, disc.problem, expanded[part.ids]) if has_kinks(disc) else None
 
     told = []
-    if (missed := share(_made(run, left), values)) > MISSED:
+    if (between := share(_made(run, left), values)) > MISSED:
         told.append(
-            f"Between the particles the equations are missed by as much as makes {missed:.0%} of the solution: a "
+            f"Between the particles the equations are missed by as much as makes {between:.0%} of the solution: a "
             "source or a coefficient changes within the spacing, unseen by the particles; refine there, or smooth it."
         )
     if (kinks := share(_made(run, beyond), values)) > CLEARED:
@@ -52,6 +53,18 @@ def unseen(run: Any, values: np.ndarray) -> list[str]:
             "them: refine the boundary, or smooth the data."
         )
     return told
+
+
+def out_of_reach(run: Any, values: np.ndarray) -> np.ndarray:
+    """What values that the polynomials of their own region do not reach make of the solution, (N, F)."""
+    disc, defects = run.disc, np.zeros(run.disc.held.shape)
+    if run.nums is None or run.factor is None:
+        return defects
+    expanded = np.asarray(whole_coefficients(disc, run.nums, values), float)
+    for part, rows in zip(disc.parts, run.parts):
+        if part.name not in run.squared:
+            defects[part.ids] = missed(part.disc, rows, values[part.ids], expanded[part.ids], LOST[disc.rec.order > 3])
+    return made_of(run, TIMES * defects)[0]
 
 
 def _data(part: Part, own: Numbers) -> Numbers | None:

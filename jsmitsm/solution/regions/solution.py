@@ -14,6 +14,7 @@ from jsmitsm.runtime.arrays import ArrayLike, ValueOrFunction
 from jsmitsm.runtime.errors import did_you_mean, explaining
 from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.solution.evaluation import checked_points
+from jsmitsm.solution.regions.between import out_of_reach
 from jsmitsm.solution.regions.fit import RegionPart
 from jsmitsm.solution.regions.located import located
 from jsmitsm.solution.solution import Solution
@@ -45,6 +46,9 @@ class RegionsSolution(Solution):
     """
 
     cloud: Any
+
+    def _beyond(self, values: np.ndarray) -> np.ndarray:
+        return out_of_reach(self._report, values)
 
     @explaining
     def region(self, name: str) -> Solution:

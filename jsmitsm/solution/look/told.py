@@ -1,0 +1,82 @@
+"""Sentences of what no particle sees of a problem, and no estimate with them."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from jsmitsm.discretization.parts.whole import whole
+from jsmitsm.runtime.errors import some
+from jsmitsm.solution.look.between import between, even, seam, unseen_data
+from jsmitsm.solution.look.reach import far_out, unmet
+from jsmitsm.solution.look.sizes import share
+
+# An estimated error below this part of the solution clears what only suspects the resolution ...
+CLEARED = 0.02
+# ... unless what is missed between the particles would make so much of the solution, or where the source says so too.
+MISSED, AGREED = 1.0, 0.3
+# ... or boundary data so much: seven particles a wavelength leave an eighth of the data.
+DATA = 0.3
+# ... or values that no polynomial reaches by far: above 0.27 where estimates were blind, below 0.05 of solutions right
+# to 1 %.
+REACHED = 0.2
+
+
+def unseen(
+    run: Any, values: np.ndarray, found: dict[str, float], cleared: bool, narrow: bool
+) -> list[str]:  # fmt: skip
+    """What no particle sees, and with them no estimate: between them, and beyond a seam.
+
+    cleared: by cheap tests, without an estimate; narrow: the source is not resolved, as they say.
+    """
+    disc, every, fitted = run.disc, whole(run.disc), cache(lambda: run.fitted(run.nums, values))
+    part = lambda missed: share(every.own(missed), every.own(values), told=every)
+    found["missed"] = missed = 0.0 if cleared and even(run) else part(between(run, fitted))
+    found["seam"] = beyond = part(seam(run, values))
+    told = list[str]()
+    # Constant coefficients degenerate nowhere, and layers that fall to nothing within the spacing may be right.
+    if not (disc.linear and disc.traced.constant):
+        told += out_of_reach(run, values, found, cleared)
+    if missed > (AGREED if narrow else MISSED):
+        told.append(
+            f"Between the particles the equation is missed by as much as makes {missed:.0%} of the solution: the "
+            "source or a coefficient changes within the spacing, unseen by the particles; refine there, or smooth it."
+        )
+    told += data(run, values, found)
+    if beyond > CLEARED:
+        told.append(
+            f"The equation is not the same on both sides of a periodic pair, which makes {beyond:.0%} of the solution: "
+            "let the source and the coefficients repeat themselves, or refine there."
+        )
+    return told
+
+
+def data(run: Any, values: np.ndarray, found: dict[str, float]) -> list[str]:
+    """Of boundary data between the particles."""
+    every = whole(run.disc)
+    found["data"] = made = share(every.own(unseen_data(run)), every.own(values), told=every)
+    if made <= DATA:
+        return []
+    return [
+        f"Between the particles boundary data change by as much as makes {made:.0%} of the solution, unseen by them: "
+        "refine the boundary, or smooth the data."
+    ]
+
+
+def out_of_reach(run: Any, values: np.ndarray, found: dict[str, float], alone: bool = True) -> list[str]:
+    """Of values that the polynomials of their neighbours do not reach; alone: without an estimate."""
+    every = whole(run.disc)
+    made, at = unmet(run, values) if alone else far_out(run, values)
+    part, most = share(every.own(made), every.own(values), told=every), CLEARED if alone else REACHED
+    found["unmet"], at = part, every.named(at)
+    if part <= most and alone:
+        return out_of_reach(run, values, found, alone=False)
+    if part <= most:
+        return []
+    return [
+        f"The local polynomials of {len(at)} particle(s), first {some(at)}, do not reach their nearest neighbours, "
+        f"which makes {part:.0%} of the solution, and no order sees it: beside a point where conditions or their data "
+        "change, a corner or a singular point, or in a layer thinner than the spacing; refine there."
+    ]
