@@ -20,7 +20,7 @@ from jsmitsm.taylor.multi_indices import multi_indices
 # A polynomial does not reach its nearest neighbours where it misses one by this part of the largest change to any of
 # them. Of smooth solutions the largest is 0.01 at order 2, of square roots and jumps of data 0.1 to 0.5. By order: up
 # to 3, and above.
-LOST = (0.03, 0.01)
+LOST = (0.1, 0.01)
 # By far are those missed whose miss is this part of the change.
 FAR = 0.2
 # The error is so many times what misses, drawn at random, make of the solution. Measured on singular points and jumps
