@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import jax.numpy as jnp
@@ -9,6 +10,7 @@ import numpy as np
 
 from jsmitsm.discretization.layout import Class, Discretization
 from jsmitsm.runtime.tracers import is_traced
+from jsmitsm.runtime.whole_program import in_one_program
 from jsmitsm.taylor.multi_indices import multi_indices
 
 # A quadratic fit takes the place of the series where its misfit is less than the first part of the series', and that is
@@ -26,31 +28,43 @@ def softened(disc: Discretization, ids: np.ndarray, source: Any, values: Any) ->
     recursion goes the more it makes of it. What is smooth, resolved or not, stays as it is. Where coefficients have
     kinks as well the source stays: both may belong together, and the series of one side are those of a solution on it.
     """
-    xp = jnp if is_traced(source, values, disc.points) or any(is_traced(c.neighbours) for c in disc.classes) else np
-    source, place = xp.asarray(source), np.full(len(disc.cloud), -1)
+    place = np.full(len(disc.cloud), -1)
     place[ids] = np.arange(len(ids))
-    for cls in disc.classes:
-        at = place[cls.ids]
-        for equation in range(len(disc.rec.levels)):
-            rows = np.array([k for k, (e, _) in enumerate(disc.rec.row_index) if e == equation])
-            new = _judged(disc, cls, equation, source[rows][:, at], xp.asarray(values)[equation], xp)
+    classes = [(cls.ids, place[cls.ids], cls.neighbours, _owners(disc, cls)) for cls in disc.classes]
+    row_index = disc.rec.row_index
+    equations = tuple(
+        (degree, tuple(k for k, (e, _) in enumerate(row_index) if e == equation))
+        for equation, degree in enumerate(disc.rec.degrees)
+    )
+    return _softened(source, values, disc.points, classes, equations)
+
+
+def _owners(disc: Discretization, cls: Class) -> Any:
+    """Whose values the neighbours (n, w) of a class have, images' those of their particles; their own where none is."""
+    xp = jnp if is_traced(cls.neighbours) else np
+    return disc.images.owners(xp.where(cls.neighbours >= 0, cls.neighbours, cls.ids[:, None]))
+
+
+@partial(in_one_program, static=("equations",))
+def _softened(source: Any, values: Any, points: Any, classes: list[Any], equations: tuple[Any, ...]) -> Any:
+    """classes: of each one its ids, their places in the source, neighbours and owners; equations: degree and rows."""
+    xp = jnp if is_traced(source, values, points, classes) else np
+    source, values, points = xp.array(source), xp.asarray(values), xp.asarray(points)
+    for ids, at, near, owners in classes:
+        offset = xp.where((near >= 0)[..., None], points[xp.where(near >= 0, near, 0)] - points[ids][:, None], 0.0)
+        for there, (degree, rows) in zip(values, equations):
+            some = np.array(rows)[:, None], at
+            new = _judged(offset, near >= 0, there[owners], degree, source[some], xp)
             if xp is np:
-                source = source.copy()
-                source[rows[:, None], at] = new
+                source[some] = new
             else:
-                source = source.at[rows[:, None], at].set(new)
+                source = source.at[some].set(new)
     return source
 
 
-def _judged(disc: Discretization, cls: Class, equation: int, series: Any, values: Any, xp: Any) -> Any:
-    """The series (T, n) of one equation's source at the particles of a class, or what is fitted to its values (N,)."""
-    dim, degree = disc.rec.dim, disc.rec.degrees[equation]
-    near, points = xp.asarray(cls.neighbours), xp.asarray(disc.points)
-    valid = near >= 0
-    offset = xp.where(valid[..., None], points[xp.where(valid, near, 0)] - points[cls.ids][:, None], 0.0)
-    square = xp.sum(offset**2, axis=2)
-    length = xp.sqrt(xp.max(square, axis=1))
-    there = values[disc.images.owners(xp.where(valid, near, cls.ids[:, None]))]
+def _judged(offset: Any, valid: Any, there: Any, degree: int, series: Any, xp: Any) -> Any:
+    """The series (T, n) of one equation's source, or what is fitted to its values (n, w) at the offsets (n, w, D)."""
+    length = xp.sqrt(xp.max(xp.sum(offset**2, axis=2), axis=1))
     valid = valid & xp.isfinite(there)  # a source may be infinite on the boundary
     there = xp.where(valid, there, 0.0)
     count = xp.maximum(xp.sum(valid, axis=1), 1)
@@ -61,9 +75,9 @@ def _judged(disc: Discretization, cls: Class, equation: int, series: Any, values
     size = mean(there)
     astray = (misled > MISLED**2 * promised) | (promised > DIVERGED**2 * size)
     switch = (missed < BETTER**2 * misled) & astray & (misled > FAINT**2 * size)
-    scaled = fit.T / length ** np.array([sum(c) for c in multi_indices(dim, DEGREE)])[:, None]
+    scaled = fit.T / length ** np.array([sum(c) for c in multi_indices(offset.shape[2], DEGREE)])[:, None]
     kept = min(len(scaled), len(series))
-    fitted = xp.concatenate([scaled[:kept], xp.zeros((len(series) - kept, len(cls.ids)))])
+    fitted = xp.concatenate([scaled[:kept], xp.zeros((len(series) - kept, series.shape[1]))])
     return xp.where(switch, fitted, series)
 
 
