@@ -17,6 +17,7 @@ from jsmitsm.equation.unknowns.stated import floats
 from jsmitsm.runtime.jaxprs import used_inputs
 from jsmitsm.runtime.progress import bar
 from jsmitsm.runtime.tracers import concrete, is_traced
+from jsmitsm.runtime.whole_program import in_one_program
 from jsmitsm.solution.fit import Fit, Recipe
 from jsmitsm.solution.regions.fit import RegionsFit
 from jsmitsm.solution.unknowns.bordered import Bordered, BorderedRegionsRun
@@ -260,16 +261,23 @@ def _same(one: list[Any], two: list[Any]) -> bool:
 
 def _entered_linearly(run: Bordered, answer: Response, start: Any, unknowns: Any) -> Any:
     """Whether the unknowns entered as they were taken to."""
-    away = jnp.stack([unknowns[n] - start[n] for n in start])
+    away = [unknowns[n] - start[n] for n in start]
     nums = run.numbers_of(run.moved(unknowns))
-    found = (answer.right, answer.columns @ away, run.right_of(nums)), (
-        answer.nums.held, jnp.tensordot(away, answer.held, axes=1), nums.held
-    )  # fmt: skip
+    found = (answer.right, answer.columns, run.right_of(nums)), (answer.nums.held, answer.held.T, nums.held)
+    return jax.lax.stop_gradient(_straight(away, found))
+
+
+@in_one_program
+def _straight(away: list[Any], found: Any) -> Any:
+    """Whether what was, with slopes times the way, is what is there."""
+    xp: Any = jnp if is_traced(away, found) else np
     linearly: Any = True
-    for first, moved, there in found:
-        size = jnp.stack([jnp.abs(part).max(initial=0.0) for part in (first, moved, there)]).max()
-        linearly &= ~(jnp.abs(first + moved - there).max(initial=0.0) > LINEAR * size)  # NaN are told elsewhere
-    return jax.lax.stop_gradient(linearly)
+    for parts in found:
+        first, slopes, there = map(xp.asarray, parts)
+        moved = (slopes @ xp.array(away, float)).T
+        size = xp.stack([xp.abs(part).max(initial=0.0) for part in (first, moved, there)]).max()
+        linearly &= ~(xp.abs(first + moved - there).max(initial=0.0) > LINEAR * size)  # NaN are told elsewhere
+    return linearly
 
 
 def _solved(run: Bordered, answer: Response) -> tuple[Any, Any]:

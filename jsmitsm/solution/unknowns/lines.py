@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -12,6 +13,7 @@ import numpy as np
 from jsmitsm.equation.problem import Problem
 from jsmitsm.runtime.errors import IN_FUNCTIONS, in_words
 from jsmitsm.runtime.tracers import concrete, is_traced
+from jsmitsm.runtime.whole_program import in_one_program
 from jsmitsm.solution.fit import Recipe
 from jsmitsm.solution.unknowns.bordered import Bordered, BorderedRegionsRun
 from jsmitsm.solution.unknowns.solution import Probe, RegionsProbe
@@ -75,19 +77,33 @@ class Lines:
 
     def met(self, rest: Any, by_value: Any, by_unknown: Any, values: Any, unknowns: dict[str, Any]) -> Any:
         """Whether what is missed is small beside what it is made of."""
-        size = abs(by_value) @ abs(values).reshape(-1) + sum(
-            (abs(by_unknown[:, k] * unknowns[n]) for k, n in enumerate(self.names)),
-            abs(jnp.stack([jnp.asarray(c.value, float) for c in self.constraints])),
-        )
-        return jnp.all(abs(rest) <= MET * jnp.where(size > 0, size, 1.0))
+        wanted = [c.value for c in self.constraints]
+        return _met(rest, by_value, by_unknown, values, [unknowns[n] for n in self.names], wanted)
 
     def of_free(self, by_value: Any) -> Any:
         """Slopes (C, n) by the free values, from those by all (C, N F): a periodic image adds to its partner's."""
         disc = self.run.disc
         number = disc.unknowns.reshape(-1)
         place = np.flatnonzero(number >= 0)
-        count = int((~disc.held).sum())
-        return jnp.zeros((len(by_value), count)).at[:, number[place]].add(by_value[:, place])
+        return _added(by_value, place, number[place], int((~disc.held).sum()))
+
+
+@in_one_program
+def _met(rest: Any, by_value: Any, by_unknown: Any, values: Any, unknowns: list[Any], wanted: list[Any]) -> Any:
+    xp: Any = jnp if is_traced(rest, by_value, by_unknown, values, unknowns, wanted) else np
+    moved = xp.abs(by_unknown) @ xp.abs(xp.array(unknowns, float))
+    size = xp.abs(by_value) @ xp.abs(values).reshape(-1) + moved + xp.abs(xp.array(wanted, float))
+    return xp.all(xp.abs(rest) <= MET * xp.where(size > 0, size, 1.0))
+
+
+@partial(in_one_program, static=("count",))
+def _added(by_value: Any, place: Any, number: Any, count: int) -> Any:
+    """Columns ``place`` of slopes (C, N F), each added to the column ``number`` of (C, count)."""
+    if is_traced(by_value):
+        return jnp.zeros((len(by_value), count)).at[:, number].add(by_value[:, place])
+    out = np.zeros((len(by_value), count))
+    np.add.at(out, (slice(None), number), np.asarray(by_value)[:, place])
+    return out
 
 
 def number(x: Any) -> Any:
