@@ -28,11 +28,11 @@ __version__ = "0.2.0"
 __all__ = [
     "Adapted", "Cloud", "Condition", "Constant", "CubicSpline", "Evolution", "Factorization", "Formulation",
     "Gaussian", "Kernel", "Method", "Modes", "Problem", "Quality", "Solution", "SolveError", "Solver", "Stencils",
-    "SuperGaussian", "TuneResult", "Wendland", "adapt", "box", "condition", "constraint", "continuation", "dirichlet",
-    "divergence", "dt", "eigen", "evolve", "factorize", "files", "fix", "free", "from_polygon", "from_sdf", "grad",
-    "hessian", "interface", "interval", "laplacian", "meant", "multi_indices", "neumann", "no_progress", "partial",
-    "periodic", "plot", "point_source", "quadrature", "quality", "rectangle", "regions", "robin", "sdf",
-    "show_versions", "solve", "stencils", "tune",
+    "SuperGaussian", "TuneResult", "Wendland", "adapt", "box", "condition", "constraint", "continuation",
+    "dirichlet", "divergence", "dt", "eigen", "evolve", "factorize", "files", "fix", "free", "from_polygon",
+    "from_sdf", "grad", "hessian", "interface", "interval", "laplacian", "meant", "multi_indices", "neumann",
+    "no_progress", "node_weights", "partial", "periodic", "plot", "point_source", "quadrature", "quality",
+    "rectangle", "regions", "robin", "sdf", "show_versions", "solve", "stencils", "tune",
 ]  # fmt: skip
 
 # Imported when first used, the solver too: who draws or makes clouds need not wait for it. Where each stands is said
@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from jsmitsm.cloud.quadrature import quadrature
     from jsmitsm.cloud.quality import Quality, quality
     from jsmitsm.cloud.regions.making import regions
+    from jsmitsm.cloud.regions.node_weights import node_weights
     from jsmitsm.cloud.shapes import from_polygon, from_sdf
     from jsmitsm.evolution.evolution import Evolution
     from jsmitsm.evolution.evolve import evolve
@@ -77,6 +78,7 @@ else:
         "files": "show",
         "from_polygon": "cloud.shapes",
         "from_sdf": "cloud.shapes",
+        "node_weights": "cloud.regions.node_weights",
         "plot": "show",
         "quadrature": "cloud.quadrature",
         "quality": "cloud.quality",

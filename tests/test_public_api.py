@@ -41,6 +41,8 @@ def test_every_public_name_is_there_and_says_what_it_is(name):
 
 def test_completion_offers_every_public_name():
     """In a fresh process: what is imported when first used must be seen before."""
+    for module in (js.sdf, js.plot, js.files):
+        assert dir(module) == sorted(module.__all__)
     seen = in_a_fresh_process("import jsmitsm as js; print([n for n in dir(js) if n[0] != '_'])")
     assert set(ast.literal_eval(seen)) == set(js.__all__) >= {*NAMES, "tune", "TuneResult", "plot", "files", "sdf"}
     assert all(getattr(js, name) is not None for name in js.__all__)

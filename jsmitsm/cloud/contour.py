@@ -67,8 +67,9 @@ def _without_tips(
             lone = tree is None or tree.query(loop)[0].min() > float(spacing(loop).max())
             if lone or region.values(middle)[0] > 0:
                 raise ValueError(
-                    f"spacing: too coarse for the shape, a closed boundary near {loop[0]} is only {length:.2g} "
-                    f"spacings round, at least {levelset.LEAST:g} are needed; reduce the spacing there (it may be a "
+                    f"spacing: too coarse for the shape, a closed boundary near {loop[0]} is only "
+                    f"{length:.2g} times as long as the spacing, at least {levelset.LEAST:g} are needed; reduce the "
+                    "spacing there (it may be a "
                     "function of the position)"
                 )
     return large

@@ -180,8 +180,8 @@ def edge_particles(
     lengths = np.array([filling.path_lengths(path, spacing)[-1] for path in paths])
     if lengths.sum() < levelset.LEAST:
         raise ValueError(
-            f"spacing: too coarse for the shape, {name} is only {lengths.sum():.2g} spacings round, "
-            f"at least {levelset.LEAST:g} are needed"
+            f"spacing: too coarse for the shape, the outline of {name} is only "
+            f"{lengths.sum():.2g} times as long as the spacing, at least {levelset.LEAST:g} are needed"
         )
     sharp = turn > _SHARP
     if forced is not None:

@@ -30,7 +30,7 @@ from jsmitsm.particle.elimination import Scheme
 from jsmitsm.particle.kernels import Constant, Kernel
 from jsmitsm.particle.recursion import Recursion, free_indices, recursion
 from jsmitsm.runtime.compiled import at_hand
-from jsmitsm.runtime.errors import IN_FUNCTIONS, in_words, is_whole
+from jsmitsm.runtime.errors import IN_FUNCTIONS, is_whole, of_the_pde
 from jsmitsm.runtime.tracers import concrete, is_traced, owned
 
 _LARGE = 1 << 22  # bytes of the user's stencils that are quickly compared
@@ -352,9 +352,7 @@ def _traced(problem: Problem, dim: int) -> Traced:
     try:
         return trace(problem.pde, dim, problem.fields, params=problem.params)
     except IN_FUNCTIONS as error:
-        text = in_words(error)
-        raise ValueError(text if text.startswith("pde") else f"pde: {text}; it returns a number or a scalar per "
-                         "equation") from error  # fmt: skip
+        raise ValueError(of_the_pde(error)) from error
 
 
 def _check_operator(traced: Traced, problem: Problem, order: int) -> None:

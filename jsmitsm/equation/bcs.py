@@ -10,7 +10,7 @@ import numpy as np
 
 from jsmitsm.equation.traced import Traced
 from jsmitsm.runtime.arrays import ArrayLike, ValueOrFunction
-from jsmitsm.runtime.errors import explaining, is_whole, refuse_masked, short
+from jsmitsm.runtime.errors import explaining, is_whole, refuse_masked, short, some
 from jsmitsm.runtime.tracers import is_traced
 
 
@@ -309,5 +309,7 @@ def checked_value(value: Any, name: str) -> Any:
             f"{name}: expected a number, an array over the group or a function of x, got {short(value)}"
         ) from None
     if not np.isfinite(array).all():
-        raise ValueError(f"{name}: NaN or infinite numbers; give finite boundary data")
+        bad = np.argwhere(~np.isfinite(array))
+        where = "" if array.ndim == 0 else f" at {some(bad[:, 0])}"
+        raise ValueError(f"{name}: NaN or infinite numbers{where}; give finite boundary data")
     return value if isinstance(value, jax.Array) or array.ndim == 0 else array

@@ -300,7 +300,7 @@ def _array_valued(function: Any) -> Callable[[Any], Any]:
     if not callable(function):
         raise ValueError(
             f"an operator takes a field or a function of the point, got {type(function).__name__}; "
-            "write js.grad(u)(x), not js.grad(u(x)) (docs: problems)"
+            "write js.grad(u)(x), not js.grad(u(x)), and pde(u, x), the field first (docs: problems)"
         )
 
     def value(y: Any) -> Any:

@@ -161,7 +161,10 @@ class Evolution(Copied):
         0.611
         """
         if is_traced(self._u) or jnp.ndim(self._u) != 3:
-            raise ValueError("at: inside of a JAX transform, or of what jax.vmap made, only .t and .u can be read")
+            raise ValueError(
+                "at: inside of a JAX transform, or of what jax.vmap made, only .t and .u can be read; make what is "
+                "wanted of the values at the particles, an integral as js.node_weights(cloud) @ run.u[-1] (docs: time)"
+            )
         try:
             time = float(t)
         except (TypeError, ValueError, OverflowError):

@@ -18,7 +18,7 @@ import numpy as np
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 # What a user's function may raise when it is called.
-IN_FUNCTIONS = (TypeError, ValueError, IndexError, AttributeError, ArithmeticError, RecursionError)
+IN_FUNCTIONS = (TypeError, ValueError, LookupError, AttributeError, ArithmeticError, RecursionError)
 # What a flag says, in words that no other one has, and where docs/symptoms.md explains it.
 SYMPTOMS = {
     "of their range between neighbours": "roughness",
@@ -294,6 +294,8 @@ def in_words(error: Exception) -> str:
     if isinstance(error, IndexError):
         return (f"{text}; x is one point of shape (D,), x[0] its first coordinate; u(x) is a number, and a vector (F,) "
                 "with js.Problem(..., fields=F)")  # fmt: skip
+    if isinstance(error, KeyError):
+        return f"nothing is called {text} in what it was given; its names are those of params and unknowns"
     if isinstance(error, OverflowError):
         return ("a number too large for floats, which end at 1.8e308, or for whole numbers of 64 bits; write large "
                 "ones as floats (1e20 for 10**20), and divide the equation by a number of their size")  # fmt: skip
@@ -302,7 +304,15 @@ def in_words(error: Exception) -> str:
                 "a loop in one function in place of closures in each other, or call sys.setrecursionlimit")  # fmt: skip
     if isinstance(error, AttributeError) and error.name is not None:
         return f"{text}{did_you_mean(error.name, dir(error.obj))}"
+    if isinstance(error, TypeError) and re.match(r"(grad|laplacian|divergence|hessian|partial|dt)\(\) takes", text):
+        return f"{text}; an operator makes a function of the point: js.laplacian(u)(x)"
     return text
+
+
+def of_the_pde(error: Exception) -> str:
+    """What went wrong when a user's equation was called."""
+    text = in_words(error)
+    return text if text.startswith("pde") else f"pde: {text}; a pde returns a number, or one for each equation"
 
 
 def refuse_masked(value: Any, name: str) -> None:

@@ -26,6 +26,10 @@ from jsmitsm.solution.solution import Solution
 
 __all__ = ["from_csv", "from_mesh", "from_shapely", "to_csv", "to_mesh", "to_pandas", "to_pvd", "to_xarray"]
 
+
+def __dir__() -> list[str]:
+    return __all__
+
 _AXES = "xyz"
 _CELLS = {1: "line", 2: "triangle", 3: "tetra"}
 

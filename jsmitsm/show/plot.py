@@ -31,6 +31,10 @@ __all__ = ["adaptation", "animate", "cloud", "convergence", "deformed", "error",
            "solid", "solution", "sparsity", "streamlines", "tuning", "values", "vectors"]  # fmt: skip
 
 
+def __dir__() -> list[str]:
+    return __all__
+
+
 @explaining
 def cloud(what: Cloud | Solution, *, normals: bool = False, support: int | None = None, kernel: Kernel | None = None,
           stencils: Stencils | None = None, legend: bool = True, ax: Any = None) -> Any:  # fmt: skip

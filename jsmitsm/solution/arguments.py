@@ -16,7 +16,7 @@ from jsmitsm.equation.regions.interface import INTERFACE
 from jsmitsm.equation.regions.per_region import PerRegion
 from jsmitsm.linear.linsolve import SOLVERS, Solver
 from jsmitsm.particle.kernels import Kernel
-from jsmitsm.runtime.errors import is_number, is_whole, numbers, refuse_masked, refuse_no_switch, refuse_word, short
+from jsmitsm.runtime.errors import is_whole, numbers, refuse_masked, refuse_no_switch, refuse_word, short
 from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.taylor.multi_indices import HIGHEST
 
@@ -131,12 +131,11 @@ def _check_starts(u0: Mapping[str, Any], cloud: Any, fields: int) -> None:
     if set(u0) != set(regions) or not regions:
         raise ValueError(f"u0: starts for the regions {list(u0)}; the cloud has {list(regions) or 'none'}")
     for name, given in u0.items():
-        here = (len(regions[name]), fields)
-        _check_start(np.full(here, given) if is_number(given) else given, here, f"u0[{name!r}]")
+        _check_start(given, (len(regions[name]), fields), f"u0[{name!r}]")
 
 
 def _check_start(u0: Any, shape: tuple[int, int], name: str = "u0") -> None:
-    """A start for Newton's method: nothing, a function, or finite values of the right shape."""
+    """A start for Newton's method: nothing, a function, a number, or finite values of the right shape."""
     if u0 is None or callable(u0) or is_traced(u0):
         return
     refuse_masked(u0, name)
@@ -145,8 +144,8 @@ def _check_start(u0: Any, shape: tuple[int, int], name: str = "u0") -> None:
             raise TypeError
         values = numbers(name, u0)
     except (TypeError, ValueError, OverflowError):
-        raise ValueError(f"{name}: expected a function of x or an array, got {short(u0)}") from None
-    if values.shape not in (shape, shape[:1]):
-        raise ValueError(f"{name}: expected a function, ({shape[0]},) or {shape}, got shape {values.shape}")
+        raise ValueError(f"{name}: expected a function of x, a number or an array, got {short(u0)}") from None
+    if values.shape not in ((), shape, shape[:1]):
+        raise ValueError(f"{name}: expected a function, a number, ({shape[0]},) or {shape}, got shape {values.shape}")
     if not np.isfinite(values).all():
         raise ValueError(f"{name}: NaN or infinite values; start from finite ones")

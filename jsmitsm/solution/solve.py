@@ -92,9 +92,9 @@ def solve(
     solver : {"auto", "dense", "sparse", "mixed", "iterative"}
         "auto", "dense" (pure JAX), "sparse" (direct), "mixed" (direct, its factors in float32 and the rest in
         float64: two thirds of the time and memory) or "iterative".
-    u0 : array_like or function, optional
-        Start of Newton's method for a nonlinear problem: (N,), (N, F) or a function of x; with several regions also a
-        dict of them, or of numbers, by region.
+    u0 : array_like, float or function, optional
+        Start of Newton's method for a nonlinear problem: (N,), (N, F), a number or a function of x; with several
+        regions also a dict of them by region.
     throw : bool
         Raise ``js.SolveError`` where the solve fails; otherwise, and always under jit, ``converged`` is
         False.

@@ -36,6 +36,14 @@ def test_weights_of_the_particles_integrate_polynomials():
             assert abs(found - 1 / (i + 1) / (j + 1)) < 1e-13
 
 
+def test_weights_are_public_and_refuse_what_they_cannot_take():
+    weights = js.node_weights(ROD)
+    assert abs(weights @ np.exp(ROD.points[:, 0]) - (np.e - 1)) < 1e-8
+    for given, word in ((("rod",), "cloud: expected a js.Cloud, got str"), ((ROD, 2.5), "degree: expected a whole")):
+        with pytest.raises(ValueError, match=word):
+            js.node_weights(*given)
+
+
 def test_an_integral_term_and_its_boundary_conditions():
     truth = np.exp(ROD.points[:, 0])
     cases = [

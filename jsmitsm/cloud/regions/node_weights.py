@@ -7,22 +7,58 @@ import numpy as np
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.cloud.quadrature import quadrature
 from jsmitsm.cloud.regions.region_cloud import RegionCloud
+from jsmitsm.runtime.errors import explaining, is_whole
 from jsmitsm.taylor.multi_indices import count, multi_indices
 
 # Particles fitted at a time.
 _CHUNK = 1000
 
 
-def node_weights(cloud: Cloud, degree: int) -> np.ndarray:
-    """Weights (N,): sum(w f) is the integral of f, in each region, of an error O(spacing^(degree + 1)).
+@explaining
+def node_weights(cloud: Cloud, degree: int = 4) -> np.ndarray:
+    """Weights of the particles, for integrals over the domain of what is known there only.
 
-    The rule of ``js.quadrature`` asks for f between the particles; there it is the polynomial of the nearest one,
-    fitted to its neighbours, and its own value has to be met.
+    ``weights @ f`` is the integral of f, of an error O(spacing^(degree + 1)). The rule of ``js.quadrature`` asks for f
+    between the particles; there it is the polynomial of the nearest one, fitted to its neighbours, and its own value
+    has to be met.
+
+    Parameters
+    ----------
+    cloud : Cloud
+        The particles; of several regions each by itself.
+    degree : int
+        Of the polynomials that are integrated exactly, lower where the particles are too few.
+
+    Returns
+    -------
+    ndarray (N,)
+        A weight for each particle, in units of length to the power D; some may be negative.
+
+    Raises
+    ------
+    ValueError
+        For what is no cloud, and a degree that is no whole number from 1.
+
+    Examples
+    --------
+    >>> import jsmitsm as js
+    >>> cloud = js.rectangle((0.0, 0.0), (2.0, 1.0), (9, 5))
+    >>> weights = js.node_weights(cloud)
+    >>> round(float(weights @ cloud.points[:, 0] ** 2), 12)
+    2.666666666667
     """
+    if not isinstance(cloud, Cloud):
+        raise ValueError(f"cloud: expected a js.Cloud, got {type(cloud).__name__}")
+    if not is_whole(degree, 1):
+        raise ValueError(f"degree: expected a whole number from 1, got {degree!r}")
+    return _weights(cloud, int(degree))
+
+
+def _weights(cloud: Cloud, degree: int) -> np.ndarray:
     if isinstance(cloud, RegionCloud):
         out = np.zeros(len(cloud))
         for name, ids in cloud.regions.items():
-            out[ids] = node_weights(cloud.region(name), degree)
+            out[ids] = _weights(cloud.region(name), degree)
         return out
     from scipy.spatial import cKDTree
 

@@ -70,6 +70,10 @@ __all__ = [
 ]
 
 
+def __dir__() -> list[str]:
+    return __all__
+
+
 def ball(center: Any, radius: Any) -> Sdf:
     """The ball |x - center| < radius in any dimension, also called ``sphere``.
 

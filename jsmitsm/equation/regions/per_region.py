@@ -47,6 +47,7 @@ def per_region(equations: Mapping[str, Callable[..., Any]]) -> PerRegion:
             raise ValueError(f"pde: the key {name!r} is no string; use the names of the regions")
         if not callable(pde) and not isinstance(pde, Traced):
             raise ValueError(
-                f"pde[{name!r}]: expected a function pde(u, x) returning the residual, got {type(pde).__name__}"
+                f"pde[{name!r}]: expected a function pde(u, x) returning the residual, got {type(pde).__name__}; it is "
+                "js.Problem(pde, bcs), the equation first"
             )
     return PerRegion(equations)

@@ -28,7 +28,7 @@ from jsmitsm.equation.traced import Traced
 from jsmitsm.equation.tracing import moving, restricted, trace
 from jsmitsm.evolution.space.incompressible import Flow, flow_of, with_pressure_equation
 from jsmitsm.runtime.collector import uncollected
-from jsmitsm.runtime.errors import IN_FUNCTIONS, in_words
+from jsmitsm.runtime.errors import IN_FUNCTIONS, of_the_pde
 from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.taylor.multi_indices import Slot
 
@@ -165,9 +165,7 @@ def _recorded(stated: Problem, dim: int) -> Traced:
     try:
         whole = trace(stated.pde, dim, stated.fields, params=stated.params)  # type: ignore[arg-type]
     except IN_FUNCTIONS as error:
-        text = in_words(error)
-        raise ValueError(text if text.startswith("pde") else f"pde: {text}; it returns a number or a scalar per "
-                         "equation") from error  # fmt: skip
+        raise ValueError(of_the_pde(error)) from error
     if whole.n_equations != stated.fields:
         raise ValueError(
             f"pde: returns {whole.n_equations} residual(s) for fields={stated.fields}; a system of F fields needs F"

@@ -49,7 +49,7 @@ def _values(given: Any, points: Any, problem: Problem, where: str) -> Any:
     if callable(given):
         return sample(given, jax.lax.stop_gradient(points), problem.params, problem.fields, where).T
     if np.ndim(given) == 0:
-        return np.full(shape, float(given))
+        return jnp.full(shape, given, float) if is_traced(given) else np.full(shape, float(given))
     return (given if is_traced(given) else np.asarray(given, float)).reshape(shape)
 
 

@@ -52,6 +52,7 @@ class Bordered(Run, ABC):
         self.right: Any = np.zeros(0)
         self.system: tuple[Any, Any, Any] = (np.zeros(0), np.zeros(0, int), np.zeros(0, int))  # entries and places
         self.squares: list[Any] = []  # parts of the least-squares form
+        self.names: list[str] = []  # of the unknowns that the columns are of
         self.multipliers = False  # whether the columns are those of free constants
         # The integral term of the problem, and the problem with it; ``problem`` is without.
         self.term: IntegralTerm | None = None
@@ -154,7 +155,16 @@ class Bordered(Run, ABC):
     def fail(self, message: str, particles: Any = ()) -> None:
         if "is a condition missing" in message:
             message += " Or two constraints say the same, or one sees nothing of what is unknown"
+            if unseen := self.unseen():
+                message += f"; neither equations nor constraints know of {unseen}"
         super().fail(message, particles)
+
+    def unseen(self) -> list[str]:
+        """The unknowns on which nothing depends."""
+        if is_traced(self.columns, self.corner) or len(self.names) != np.shape(self.columns)[1]:
+            return []
+        seen = np.abs(self.columns).max(axis=0, initial=0.0) + np.abs(self.corner).max(axis=0, initial=0.0)
+        return [name for name, some in zip(self.names, seen) if some == 0]
 
     def check_balance(self, taylor: Any = None) -> None:
         super().check_balance(taylor)

@@ -111,7 +111,7 @@ def _linearly(run: Bordered, lines: Lines, answer: Response, start: dict[str, An
     Equation and conditions are taken to be linear in both; where they are not it ends.
     """
     disc, names, count = run.disc, lines.names, len(lines.constraints)
-    run.columns = run.constants() if run.multipliers else -answer.columns
+    run.columns, run.names = run.constants() if run.multipliers else -answer.columns, names
     free = np.flatnonzero(~disc.held.reshape(-1))
     # Linear constraints do not care where they are linearised; others must not have a flat spot there.
     unknowns, values, good = start, with_held(disc, answer.nums, np.ones(len(free))), True
