@@ -179,7 +179,8 @@ def surface(corners: np.ndarray) -> Any:
     """Triangles (T, 3, 3) as pyvista's mesh, with every corner for itself."""
     import pyvista
 
-    return pyvista.PolyData.from_regular_faces(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3))
+    faces: Any = np.arange(3 * len(corners)).reshape(-1, 3)
+    return pyvista.PolyData.from_regular_faces(corners.reshape(-1, 3), faces)
 
 
 def _painted(ax: Any, corners: np.ndarray, shades: np.ndarray, label: str) -> None:

@@ -101,9 +101,9 @@ def _added(by_value: Any, place: Any, number: Any, count: int) -> Any:
     """Columns ``place`` of slopes (C, N F), each added to the column ``number`` of (C, count)."""
     if is_traced(by_value):
         return jnp.zeros((len(by_value), count)).at[:, number].add(by_value[:, place])
-    out = np.zeros((len(by_value), count))
-    np.add.at(out, (slice(None), number), np.asarray(by_value)[:, place])
-    return out
+    out = np.zeros((count, len(by_value)))
+    np.add.at(out, number, np.asarray(by_value)[:, place].T)
+    return out.T
 
 
 def number(x: Any) -> Any:
