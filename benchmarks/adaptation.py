@@ -102,7 +102,7 @@ def cells(row: dict[str, Any]) -> list[Any]:
     times = (f"{row['seconds']:.1f}", f"{row['over_last']:.1f}") if "over_last" in row else ("", "")
     fem = ("", "")
     if other:
-        clocked = f"{other['seconds']:.1f}" if times[0] else ""  # of a quiet machine, as the others
+        clocked = f"{other['seconds']:.1f}" if times[0] and "seconds" in other else ""  # of a quiet machine
         fem = f"{other['unknowns']}{'' if other['reached'] else ' (not)'}", clocked
     return [row["name"], f"{row['tol']:.0e}", "yes" if row["reached"] else "no", f"{row['true']:.1e}", ratio,
             row["particles"], row["order"], row["rounds"], *times, *fem]  # fmt: skip
@@ -136,9 +136,11 @@ def tally(rows: list[dict[str, Any]]) -> str:
     """Who needs less of those that both reach."""
     both = [r for r in rows if r.get("reached") and (r.get("elements") or {}).get("reached") and "over_last" in r]
     fewer = sum(a < b for a, b in map(sizes, both))
-    quicker = sum(r["seconds"] < r["elements"]["seconds"] for r in both)
+    clocked = [r for r in both if "seconds" in r["elements"]]
+    quicker = sum(r["seconds"] < r["elements"]["seconds"] for r in clocked)
     large = [r["over_last"] for r in rows if r.get("particles", 0) > LARGE and "over_last" in r]
-    told = [f"Of {len(both)} timed that both reach, fewer unknowns in {fewer}, less time in {quicker}."] if both else []
+    told = [f"Of {len(both)} timed that both reach, fewer unknowns in {fewer}, less time in {quicker} of "
+            f"{len(clocked)}."] if both else []  # fmt: skip
     if large:
         told.append(f"All rounds over the last where it has more than {LARGE} particles: {min(large):.1f} to "
                     f"{max(large):.1f} in {len(large)}.")  # fmt: skip
