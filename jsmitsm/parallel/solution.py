@@ -90,8 +90,8 @@ class ParallelSolution(OfOwn):
         """The size of the estimated error (n, F) of the own values."""
         if self._error is None:
             towards, units = corrected(self._local, self._values, self._linearised)
-            beyond = unseen(self._local, self.system, self._values, self._linearised)
-            self._error = np.maximum(np.abs(towards), beyond)
+            known = np.abs(towards)
+            self._error = np.maximum(known, unseen(self._local, self.system, self._values, self._linearised, known))
             own = self._values[self._local.halo.ids]
             self._share = share(self._error * units, own * units, told=self._local.whole)
         return self._error

@@ -167,11 +167,12 @@ class Solution(Anywhere):
     def _size(self, error: Any, units: Any = 1.0) -> Array:
         """The size of an estimated error (N, F), no less than what no order sees, kept for the next who asks."""
         if isinstance(self._report, Run) and not is_traced(error, self._values):
-            error = np.maximum(error, self._beyond(np.asarray(self._values, float)))
+            error = np.maximum(error, self._beyond(np.asarray(self._values, float), np.asarray(error)))
         return self._kept(error[..., 0] if self._recipe.fields == 1 else error, units)
 
-    def _beyond(self, values: np.ndarray) -> np.ndarray:
-        return beyond_orders(self._report, values)
+    def _beyond(self, values: np.ndarray, known: np.ndarray) -> np.ndarray:
+        """What no order sees of the values (N, F), beside the error that two orders tell."""
+        return beyond_orders(self._report, values, known)
 
     def _kept(self, error: Array, units: Any = 1.0) -> Array:
         if not is_traced(error, self._values):

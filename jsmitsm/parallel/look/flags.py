@@ -60,12 +60,12 @@ class Look:
         return self.local.halo.spread(np.asarray(with_held_expansions(self.disc, self.fitted(nums, values))))
 
 
-def unseen(local: Local, system: System, values: np.ndarray, taylor: Any) -> np.ndarray:
-    """What no order sees, at the own particles (n, F)."""
+def unseen(local: Local, system: System, values: np.ndarray, taylor: Any, known: np.ndarray) -> np.ndarray:
+    """What no order sees, at the own particles (n, F), beside the error that two orders tell of these."""
     with local.team.phase(local.halo.slab.number):
         look = Look(local, system, taylor)
     with local.team.phase():
-        return beyond_orders(look, values)[local.halo.ids]
+        return beyond_orders(look, values, known)[local.halo.ids]
 
 
 def told(

@@ -18,9 +18,11 @@ from jsmitsm.solution.look.between import beyond_kinks, nearest_of, solved_alone
 from jsmitsm.taylor.multi_indices import multi_indices
 
 # A polynomial does not reach its nearest neighbours where it misses one by this part of the largest change to any of
-# them. Of smooth solutions the largest is 0.01 at order 2, of square roots and jumps of data 0.1 to 0.5. By order: up
-# to 3, and above.
-LOST = (0.1, 0.01)
+# them: 0.1 to 0.5 beside square roots and jumps of data. By order: up to 3, and above.
+LOST = (0.1, 0.06)
+# Above order 3 less may be lost too, beside r^(3/2) from this part on; but a curve that the particles hardly resolve
+# has as much, whose error two orders do tell. So this counts up to so many times what they say.
+FAINT, TRUSTED = 0.01, 4.0
 # By far are those missed whose miss is this part of the change.
 FAR = 0.2
 # The error is so many times what misses, drawn at random, make of the solution. Measured on singular points and jumps
@@ -30,10 +32,22 @@ TIMES = 1.4
 NAMED = 0.2
 
 
-def beyond_orders(run: Any, values: np.ndarray) -> np.ndarray:
-    """What no order sees makes of the solution of a run, (N, F): beyond kinks and jumps, and out of reach."""
-    found, kinks = unmet(run, values)[0], beyond_kinks(run, values)
+def beyond_orders(run: Any, values: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """What no order sees makes of the solution of a run, (N, F): beyond kinks and jumps, and out of reach.
+
+    known: the error that two orders tell of the own particles.
+    """
+    found, kinks = np.maximum(unmet(run, values)[0], _faint(run, values, known)), beyond_kinks(run, values)
     return found if kinks is None else np.maximum(found, kinks)
+
+
+def _faint(run: Any, values: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """What is made of values that are hardly out of reach, no more of it than two orders make likely."""
+    if run.disc.rec.order <= 3 or run.disc.scheme.method not in ("S", "III"):
+        return np.zeros(run.disc.held.shape)
+    made, told = _unmet(run, values, FAINT)[0], whole(run.disc)
+    size = told.norm(told.own(made))
+    return made if size == 0 else made * min(1.0, TRUSTED * told.norm(known) / size)
 
 
 def unmet(run: Any, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

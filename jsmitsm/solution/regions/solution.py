@@ -47,7 +47,7 @@ class RegionsSolution(Solution):
 
     cloud: Any
 
-    def _beyond(self, values: np.ndarray) -> np.ndarray:
+    def _beyond(self, values: np.ndarray, known: np.ndarray) -> np.ndarray:
         return out_of_reach(self._report, values)
 
     @explaining
