@@ -132,9 +132,9 @@ def even(run: Any) -> bool:
     for cls in disc.classes:
         near = _looked_at(disc, cls)
         for other in near.T:
-            if uneven:
-                break
             ids, to = cls.ids[other >= 0], other[other >= 0]
+            if uneven or not len(ids):
+                continue
             ends = known[:, :, ids], known[:, :, to]
             size = np.maximum(np.maximum(*map(np.abs, ends)), SMALL * largest)
             for part in WAYS[disc.rec.dim]:
