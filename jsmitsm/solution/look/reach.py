@@ -7,6 +7,8 @@ two orders' solutions tells nothing there. What each leaves of its neighbours' v
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -17,6 +19,7 @@ from jsmitsm.particle.moments import Row
 from jsmitsm.solution.look.between import beyond_kinks, nearest_of, solved_alone
 from jsmitsm.taylor.multi_indices import multi_indices
 
+Fits = Callable[[], np.ndarray]
 # A polynomial does not reach its nearest neighbours where it misses one by this part of the largest change to any of
 # them: 0.1 to 0.5 beside square roots and jumps of data. By order: up to 3, and above.
 LOST = (0.1, 0.06)
@@ -37,20 +40,26 @@ def beyond_orders(run: Any, values: np.ndarray, known: np.ndarray) -> np.ndarray
 
     known: the error that two orders tell of the own particles.
     """
-    found, kinks = np.maximum(unmet(run, values)[0], _faint(run, values, known)), beyond_kinks(run, values)
+    fitted, kinks = fits(run, values), beyond_kinks(run, values)
+    found = np.maximum(unmet(run, values, fitted)[0], _faint(run, values, known, fitted))
     return found if kinks is None else np.maximum(found, kinks)
 
 
-def _faint(run: Any, values: np.ndarray, known: np.ndarray) -> np.ndarray:
+def fits(run: Any, values: np.ndarray) -> Fits:
+    """The local polynomials (N, F, K) of the values, made when they are asked for, and once."""
+    return cache(lambda: run.fitted(run.nums, values))
+
+
+def _faint(run: Any, values: np.ndarray, known: np.ndarray, fitted: Fits) -> np.ndarray:
     """What is made of values that are hardly out of reach, no more of it than two orders make likely."""
     if run.disc.rec.order <= 3 or run.disc.scheme.method not in ("S", "III"):
         return np.zeros(run.disc.held.shape)
-    made, told = _unmet(run, values, FAINT)[0], whole(run.disc)
+    made, told = _unmet(run, values, FAINT, fitted)[0], whole(run.disc)
     size = told.norm(told.own(made))
     return made if size == 0 else made * min(1.0, TRUSTED * told.norm(known) / size)
 
 
-def unmet(run: Any, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def unmet(run: Any, values: np.ndarray, fitted: Fits) -> tuple[np.ndarray, np.ndarray]:
     """What values out of reach make of the solution of a run, (N, F), and the particles whose polynomials these are.
 
     Nothing in the least-squares form, which has a misfit of its own, nor of method SSPH and of I and II, whose
@@ -58,21 +67,23 @@ def unmet(run: Any, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
     if run.disc.scheme.method not in ("S", "III"):
         return np.zeros(run.disc.held.shape), np.zeros(0, int)
-    return _unmet(run, values, LOST[run.disc.rec.order > 3])
+    return _unmet(run, values, LOST[run.disc.rec.order > 3], fitted)
 
 
-def far_out(run: Any, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def far_out(run: Any, values: np.ndarray, fitted: Fits) -> tuple[np.ndarray, np.ndarray]:
     """The same of values that are missed by far, each by as much as the nearest are: of any method.
 
     Where held values have no part in the solution its weights are nothing, and so is what they miss.
     """
-    return _unmet(run, values, FAR, plain=True)
+    return _unmet(run, values, FAR, fitted, plain=True)
 
 
-def _unmet(run: Any, values: np.ndarray, lost: float, plain: bool = False) -> tuple[np.ndarray, np.ndarray]:
+def _unmet(
+    run: Any, values: np.ndarray, lost: float, fitted: Fits, plain: bool = False
+) -> tuple[np.ndarray, np.ndarray]:
     if run.formulation == "lsq" or run.rows is None or run.factor is None:
         return np.zeros(run.disc.held.shape), np.zeros(0, int)
-    defects = missed(run.disc, run.rows, values, run.fitted(run.nums, values), lost, plain)
+    defects = missed(run.disc, run.rows, values, fitted(), lost, plain)
     return made_of(run, defects if plain else TIMES * defects)
 
 

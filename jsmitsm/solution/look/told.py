@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import cache
 from typing import Any
 
 import numpy as np
@@ -10,7 +9,7 @@ import numpy as np
 from jsmitsm.discretization.parts.whole import whole
 from jsmitsm.runtime.errors import some
 from jsmitsm.solution.look.between import between, even, seam, unseen_data
-from jsmitsm.solution.look.reach import far_out, unmet
+from jsmitsm.solution.look.reach import Fits, far_out, fits, unmet
 from jsmitsm.solution.look.sizes import share
 
 # An estimated error below this part of the solution clears what only suspects the resolution ...
@@ -31,14 +30,14 @@ def unseen(
 
     cleared: by cheap tests, without an estimate; narrow: the source is not resolved, as they say.
     """
-    disc, every, fitted = run.disc, whole(run.disc), cache(lambda: run.fitted(run.nums, values))
+    disc, every, fitted = run.disc, whole(run.disc), fits(run, values)
     part = lambda missed: share(every.own(missed), every.own(values), told=every)
     found["missed"] = missed = 0.0 if cleared and even(run) else part(between(run, fitted))
     found["seam"] = beyond = part(seam(run, values))
     told = list[str]()
     # Constant coefficients degenerate nowhere, and layers that fall to nothing within the spacing may be right.
     if not (disc.linear and disc.traced.constant):
-        told += out_of_reach(run, values, found, cleared)
+        told += out_of_reach(run, values, found, cleared, fitted)
     if missed > (AGREED if narrow else MISSED):
         told.append(
             f"Between the particles the equation is missed by as much as makes {missed:.0%} of the solution: the "
@@ -65,14 +64,16 @@ def data(run: Any, values: np.ndarray, found: dict[str, float]) -> list[str]:
     ]
 
 
-def out_of_reach(run: Any, values: np.ndarray, found: dict[str, float], alone: bool = True) -> list[str]:
+def out_of_reach(
+    run: Any, values: np.ndarray, found: dict[str, float], alone: bool = True, fitted: Fits | None = None
+) -> list[str]:
     """Of values that the polynomials of their neighbours do not reach; alone: without an estimate."""
-    every = whole(run.disc)
-    made, at = unmet(run, values) if alone else far_out(run, values)
+    every, fitted = whole(run.disc), fitted or fits(run, values)
+    made, at = (unmet if alone else far_out)(run, values, fitted)
     part, most = share(every.own(made), every.own(values), told=every), CLEARED if alone else REACHED
     found["unmet"], at = part, every.named(at)
     if part <= most and alone:
-        return out_of_reach(run, values, found, alone=False)
+        return out_of_reach(run, values, found, False, fitted)
     if part <= most:
         return []
     return [
