@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from jsmitsm.equation.bcs import Condition
-from jsmitsm.equation.regions.per_region import PerRegion, per_region
+from jsmitsm.equation.regions.per_region import PerRegion, by_region, per_region
 from jsmitsm.equation.traced import Traced
 from jsmitsm.equation.unknowns.constraint import Constraint
 from jsmitsm.equation.unknowns.extras import Extras, extras
@@ -32,7 +32,8 @@ class Problem:
         (``js.regions``) a dict of them, one for each region by its name.
     bcs : mapping
         Maps each boundary group to a condition, or to a list of them where the operator's order or the number of
-        fields needs several; and each interface ``"a|b"`` to ``js.interface``.
+        fields needs several; and each interface ``"a|b"`` to ``js.interface``. Where a group bounds several regions
+        a dict of them by region, arrays in them over the group or over its particles in that region.
     fields : int
         Number F of unknown fields.
     params : pytree, optional
@@ -99,7 +100,7 @@ class Problem:
         self.pde: Any = pde
         self.fields = int(fields)
         self.params = params
-        self.bcs = {name: _listed(name, value, self.fields) for name, value in bcs.items()}
+        self.bcs = {name: _listed(name, value, self.fields) for name, value in by_region(bcs, self.pde).items()}
         self.extras = extras(constraints, unknowns, dtype, sources, integral, self.pde, self.bcs)
 
     # Constraints and unknowns; most problems have none.

@@ -261,8 +261,13 @@ def _doubted(fit: Fit, low: Discretization, values: Any, error: Any) -> Any:
         other, _, _ = _towards(fit, low, values, order)
     except SolveError:
         return error
-    far, near = (share(np.asarray(e), np.asarray(values)) for e in (error, other))
-    return other * (far / near) ** DOUBT if 0.0 < near < far else error
+    return between_orders(error, other, values)
+
+
+def between_orders(higher: Any, below: Any, values: Any) -> Any:
+    """The error (N, F) towards a higher order, or between it and that towards a lower one where this is smaller."""
+    far, near = (share(np.asarray(e), np.asarray(values)) for e in (higher, below))
+    return below * (far / near) ** DOUBT if 0.0 < near < far else higher
 
 
 def comparable(disc: Discretization, nums: Numbers) -> Any:

@@ -203,6 +203,32 @@ def test_a_mesh_with_tagged_cells_is_a_cloud_of_regions():
         js.files.from_mesh(mesh, regions=["air", "wool"])
 
 
+def test_a_mesh_in_space_with_tagged_cells_has_pairs_on_the_facets_between():
+    """Hexahedra: a cube in a cube, and three regions that meet along a line."""
+    meshio = pytest.importorskip("meshio")
+    n = 5
+    nodes = np.stack(np.meshgrid(*[np.linspace(0, 1, n)] * 3, indexing="ij"), axis=-1)
+    at = np.arange(n**3).reshape(n, n, n)
+    corners = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)]
+    ends = lambda i: slice(i, n - 1 + i)  # noqa: E731
+    cells = np.stack([at[ends(i), ends(j), ends(k)].ravel() for i, j, k in corners], axis=1)
+    middle = nodes.reshape(-1, 3)[cells].mean(axis=1)
+
+    def made(tag):
+        mesh = meshio.Mesh(nodes.reshape(-1, 3), [("hexahedron", cells)], cell_data={"gmsh:physical": [tag]})
+        return js.files.from_mesh(mesh, regions=True)
+
+    cloud = made(np.where((np.abs(middle - 0.5) < 0.25).all(axis=1), 1, 2))
+    pairs, normals = cloud.interfaces["1|2"], cloud.interface_normals["1|2"]
+    points = cloud.points[pairs]
+    assert len(pairs) == 26 and (points[:, 0] == points[:, 1]).all()  # all nodes of the inner cube but its middle
+    face = (points[:, 0] == [0.75, 0.5, 0.5]).all(axis=1)
+    assert np.abs(normals[face] - [1.0, 0.0, 0.0]).max() < 1e-12
+    side = middle[:, 0] < 0.5
+    three = made(np.where(side, 1, np.where(middle[:, 1] < 0.5, 2, 3)))
+    assert {name: len(p) for name, p in three.interfaces.items()} == {"1|2": 15, "1|3": 15, "2|3": 15}
+
+
 def test_a_lattice_is_cut_by_predicates():
     """Cells belong to whom their middle satisfies: copies and normals along the sides of cells, an L for a domain."""
     halves = {"a": lambda x: x[:, 0] < 0.5, "b": lambda x: (x[:, 0] > 0.5) & (x[:, 1] < 0.5)}

@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 import jsmitsm as js
-from jsmitsm.solution.regions.flags import unlike_polynomials
+from jsmitsm.discretization.regions.layout import discretize_regions
+from jsmitsm.discretization.regions.rows import joints, region_numbers
+from jsmitsm.solution.regions.flags import corners, unlike_polynomials
 
 BOX = ((-1.0, -1.0), (1.0, 1.0))
 DISK = js.sdf.circle((0.0, 0.0), 0.5)
@@ -261,6 +263,84 @@ def test_a_fluid_carries_heat_along_a_solid(formulation):
     hot |= {"solid|fluid": js.interface(conduction(k))}
     told = js.solve(js.Problem({"solid": laplace, "fluid": wind}, hot), cloud, order=2, formulation=formulation)
     assert any("no function fits the equation" in flag for flag in told.flags)
+
+
+def two_layers(spacing):
+    half = {"a": [(0, 0), (1, 0), (1, 0.5), (0, 0.5)], "b": [(0, 0.5), (1, 0.5), (1, 1), (0, 1)]}
+    sides = {"left": lambda x: x[:, 0] < 1e-9, "right": lambda x: x[:, 0] > 1 - 1e-9, "rest": lambda x: x[:, 0] > -1}
+    return js.regions(half, spacing=spacing, groups=sides)
+
+
+def test_a_group_has_a_condition_for_each_region():
+    """Heat leaves two layers by k n . grad u + u = g, each with its own k: quadratics are exact."""
+    cloud, k = two_layers(0.125), {"a": 2.0, "b": 5.0}
+    exact = {"a": lambda x: x[0] * x[1] + x[0] ** 2 - x[1] ** 2, "b": lambda x: 3 * x[1] - x[0] + x[0] * x[1]}
+    truth, flux = values(cloud, exact), conduction(k)
+    pairs = cloud.interfaces["a|b"]
+    source = lambda x: 2.0 * jax.grad(exact["a"])(x)[1] - 5.0 * jax.grad(exact["b"])(x)[1]  # noqa: E731
+    between = js.interface(flux, jump=truth[pairs[:, 0]] - truth[pairs[:, 1]], source=source)
+
+    def loses(name):
+        given = lambda x, n: k[name] * n @ jax.grad(exact[name])(x) + exact[name](x)  # noqa: E731
+        return js.condition(lambda u, x, n: flux[name](u, x, n) + u(x) - given(x, n))
+
+    left = cloud.groups["left"]
+    of_a = np.isin(left, cloud.regions["a"])
+    bcs = {
+        "right": {n: loses(n) for n in k}, "rest": js.dirichlet(truth[cloud.groups["rest"]]), "a|b": between,
+        # Arrays over the group, or over what of it lies in the region.
+        "left": {"a": js.dirichlet(truth[left]), "b": js.dirichlet(truth[left[~of_a]])},
+    }  # fmt: skip
+    sol = js.solve(js.Problem(dict.fromkeys(k, laplace), bcs), cloud, order=2)
+    assert np.abs(sol.u - truth).max() < 1e-12 and sol.flags == []
+
+    def refused(told, **changed):
+        with pytest.raises(ValueError, match=told):
+            js.solve(js.Problem(dict.fromkeys(k, laplace), {**bcs, **changed}), cloud, order=2)
+
+    refused(r"no condition for the boundary group\(s\) \['right'\].*in the region 'b'", right={"a": loses("a")})
+    refused(r"for the region 'c'; the problem has the regions \['a', 'b'\]", right={"a": loses("a"), "c": loses("b")})
+    refused("'lid' is no boundary group of the cloud", lid=js.dirichlet(0.0))
+    refused("conditions for all regions and for 'a'", **{"left in a": bcs["left"]["a"], "left": js.dirichlet(0.0)})
+    with pytest.raises(ValueError, match="the problem has none, give the group one condition"):
+        js.Problem(laplace, {"left": {"a": js.dirichlet(0.0)}})
+
+
+def test_conditions_at_the_end_of_an_interface_that_follow_from_others_are_left_out():
+    """Free ends of two elastic layers leave no shear: the interface need not say that it is the same on both sides."""
+    cloud, stiff = two_layers(0.25), {"a": 10.0, "b": 1.0}
+    stress = lambda u, x, c: c * (js.grad(u)(x) + js.grad(u)(x).T + jnp.trace(js.grad(u)(x)) * jnp.eye(2))  # noqa: E731
+    force = {n: lambda u, x, m, c=c: stress(u, x, c) @ m for n, c in stiff.items()}
+    pde = {n: lambda u, x, c=c: js.divergence(lambda y: stress(u, y, c))(x) for n, c in stiff.items()}
+
+    def rows(pull):
+        loaded = js.condition(lambda u, x, m: force["b"](u, x, m) - pull)
+        bcs = {"left": js.dirichlet(0.0), "right": {"a": js.condition(force["a"]), "b": loaded}}
+        problem = js.Problem(pde, bcs | {"rest": js.dirichlet(0.0), "a|b": js.interface(force)}, fields=2)
+        regions = discretize_regions(problem, cloud, 2, 0)
+        return sorted({made.scheme.n_rows for made in joints(regions, region_numbers(regions))})
+
+    assert rows(np.array([1.0, 0.0])) == [3, 4]
+    with pytest.raises(ValueError, match="ends on the boundary at .*contradict those of the boundary"):
+        rows(np.array([0.0, 1.0]))  # a shear on one side alone
+
+
+def test_a_curved_surface_has_no_corners_however_coarse():
+    box = ((-1.0,) * 3, (1.0,) * 3)
+    for inner, some in ((js.sdf.sphere((0, 0, 0), 0.5), False), (js.sdf.box((-0.5,) * 3, (0.5,) * 3), True)):
+        cloud = js.regions({"in": inner, "out": js.sdf.difference(js.sdf.box(*box), inner)}, box, 0.25)
+        assert bool(len(corners(cloud))) == some
+
+
+def test_a_region_too_small_for_the_next_order_is_estimated_by_the_one_below():
+    dot = js.sdf.circle((0.0, 0.0), 0.2)
+    cloud = js.regions({"a": dot, "b": js.sdf.difference(js.sdf.rectangle(*BOX), dot)}, BOX, 0.16)
+    exact = {"a": lambda x: jnp.exp(x[0]) * jnp.cos(x[1]), "b": lambda x: jnp.exp(x[0]) * jnp.cos(x[1])}
+    bcs = {"boundary": js.dirichlet(exact["b"]), "a|b": js.interface(conduction({"a": 1.0, "b": 1.0}))}
+    sol = js.solve(js.Problem(dict.fromkeys("ab", laplace), bcs), cloud)
+    off = np.abs(sol.u - values(cloud, exact)).max()
+    # The solution of order 3 is farther off than that of order 4.
+    assert off < sol.error_estimate().max() < 20 * off and sol.flags == []
 
 
 def test_only_powers_are_singular():

@@ -15,6 +15,7 @@ from jsmitsm.discretization.layout import Class, table
 from jsmitsm.discretization.least_squares import added_up
 from jsmitsm.discretization.leave_one_out import loads
 from jsmitsm.discretization.local_data import own_conditions, particles_first, right_sides, shared_elimination
+from jsmitsm.discretization.regions.ends import independent
 from jsmitsm.discretization.regions.layout import Meeting, Part, Regions
 from jsmitsm.discretization.regions.squares import squared_loads
 from jsmitsm.discretization.rows import all_coefficients
@@ -128,7 +129,8 @@ def joints(regions: Regions, nums: RegionNumbers) -> list[Joints]:
     place = [dict(zip(p.ids.tolist(), range(len(p.ids)))) for p in regions.parts]
     for m in regions.meetings:
         own = tuple(_own_shape(regions.parts[k], place[k][i]) for k, i in zip(m.parts, m.copies))
-        kept = _kept_rows(regions, m)
+        at = [place[k][i] for k, i in zip(m.parts, m.copies)]
+        kept = independent(regions, nums, m, at, [count for count, _ in own], _kept_rows(regions, m))
         key = m.parts, tuple(name for name, _ in m.pairs), own, kept
         shapes.setdefault(key, []).append(m)
     return [_joints(regions, nums, key, found) for key, found in shapes.items()]

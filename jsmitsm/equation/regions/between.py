@@ -9,10 +9,12 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from jsmitsm.cloud.cloud import INTERIOR
 from jsmitsm.equation.bcs import Condition
 from jsmitsm.equation.conditions import component
 from jsmitsm.equation.problem import Problem, of_parts
 from jsmitsm.equation.regions.interface import INTERFACE
+from jsmitsm.equation.regions.per_region import group_and_region, members
 from jsmitsm.equation.traced import Traced
 from jsmitsm.runtime.errors import did_you_mean
 from jsmitsm.runtime.tracers import is_traced
@@ -45,9 +47,11 @@ def region_of(problem: Problem, cloud: Any, name: str) -> Problem:
     place = np.full(len(cloud), -1)
     place[ids] = np.arange(len(ids))
     new = of_parts(problem.pde[name], {}, problem.fields, problem.params)
-    for group, conditions in problem.bcs.items():
-        members = cloud.groups.get(group, np.zeros(0, int))
-        here = place[members] >= 0
+    for key, conditions in problem.bcs.items():
+        group, whose = group_and_region(key, cloud)
+        if whose not in (None, name):
+            continue
+        here = place[cloud.groups.get(group, np.zeros(0, int))] >= 0
         if group in cloud.interfaces:
             if here.any():
                 new.bcs[group] = [Condition(INTERFACE)]
@@ -104,6 +108,7 @@ def check_regions(problem: Problem, cloud: Any) -> None:
                 )
             if any(c.kind == "periodic" for c in conditions):
                 raise ValueError(f"bcs[{key!r}]: js.periodic is not made for clouds of several regions yet")
+            _check_group(problem, cloud, key, conditions)
             continue
         if len(conditions) != 1 or not meant:
             raise ValueError(f"bcs[{key!r}]: an interface takes one js.interface(...), got {conditions}")
@@ -114,6 +119,20 @@ def check_regions(problem: Problem, cloud: Any) -> None:
             f"bcs: no condition for the interface(s) {missing}; the cloud has {interfaces}. Give each js.interface("
             f'flux={{{missing[0].split("|")[0]!r}: f, {missing[0].split("|")[1]!r}: g}}), it is never guessed'
         )
+
+
+def _check_group(problem: Problem, cloud: Any, key: str, conditions: list[Condition]) -> None:
+    """Conditions on a boundary group, of one region or of all that it bounds."""
+    group, region = group_and_region(key, cloud)
+    known = [name for name in cloud.groups if name != INTERIOR and name not in cloud.interfaces]
+    if group not in known and not all(c.kind == "fix" for c in conditions):
+        raise ValueError(
+            f"bcs: {group!r} is no boundary group of the cloud; it has {known}{did_you_mean(group, known)}"
+        )
+    if region is not None and group in problem.bcs:
+        raise ValueError(f"bcs[{group!r}]: conditions for all regions and for {region!r}; give one of the two")
+    if region is not None and not len(members(key, cloud)):
+        raise ValueError(f"bcs[{group!r}]: a condition for the region {region!r}, which the group does not bound")
 
 
 def _check_sides(key: str, c: Condition) -> None:

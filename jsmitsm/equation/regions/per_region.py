@@ -6,8 +6,13 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import jax
+import numpy as np
 
 from jsmitsm.equation.traced import Traced
+from jsmitsm.runtime.errors import did_you_mean
+
+# Between a boundary group and the region whose part of it a condition is for.
+_IN = " in "
 
 
 @jax.tree_util.register_pytree_node_class
@@ -51,3 +56,35 @@ def per_region(equations: Mapping[str, Callable[..., Any]]) -> PerRegion:
                 "js.Problem(pde, bcs), the equation first"
             )
     return PerRegion(equations)
+
+
+def by_region(bcs: Mapping[str, Any], pde: Any) -> dict[Any, Any]:
+    """Conditions of which some are dicts by region, as one key for each region: ``"side in steel"``."""
+    out: dict[Any, Any] = {}
+    for group, given in bcs.items():
+        if not isinstance(given, Mapping):
+            out[group] = given
+            continue
+        known = list(pde) if isinstance(pde, PerRegion) else []
+        for region, condition in given.items():
+            if region not in known:
+                raise ValueError(
+                    f"bcs[{group!r}]: a condition for the region {region!r}; the problem has "
+                    f"{f'the regions {known}' if known else 'none, give the group one condition, or a list of them'}"
+                    f"{did_you_mean(str(region), known)}"
+                )
+            out[f"{group}{_IN}{region}"] = condition
+    return out
+
+
+def group_and_region(key: str, cloud: Any) -> tuple[str, str | None]:
+    """The boundary group and the region that the conditions under a key are for; None: all regions that it bounds."""
+    group, _, region = key.rpartition(_IN)
+    return (group, region) if key not in cloud.groups and region in getattr(cloud, "regions", ()) else (key, None)
+
+
+def members(key: str, cloud: Any) -> np.ndarray:
+    """The particles for which the conditions under a key are."""
+    group, region = group_and_region(key, cloud)
+    ids = np.asarray(cloud.groups.get(group, ()), int)
+    return ids if region is None else ids[np.isin(ids, cloud.regions[region])]

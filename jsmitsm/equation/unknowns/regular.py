@@ -15,6 +15,7 @@ from jsmitsm.equation.bcs import Condition
 from jsmitsm.equation.conditions import component
 from jsmitsm.equation.problem import Problem
 from jsmitsm.equation.regions.interface import INTERFACE
+from jsmitsm.equation.regions.per_region import members
 from jsmitsm.equation.tracing import trace
 from jsmitsm.equation.unknowns.point_source import FARTHEST, Kelvin, Singular
 from jsmitsm.runtime.errors import IN_FUNCTIONS, in_words, some
@@ -205,7 +206,7 @@ def _regular(
         raise ValueError(
             f"bcs[{name!r}]: js.{c.kind} does not go with point sources; put a Gaussian into the pde instead"
         )
-    ids = np.asarray(c.indices) if c.kind == "fix" else np.asarray(cloud.groups.get(name, ()), int)
+    ids = np.asarray(c.indices) if c.kind == "fix" else members(name, cloud)
     if not len(ids):
         return c  # refused by name later
     touched = [(singular, np.isin(ids, those)) for singular, those in parts]
@@ -216,7 +217,7 @@ def _regular(
         if not all(here.all() for _, here in touched):
             raise ValueError(
                 f"bcs[{name!r}]: a js.condition on a group that lies in a region with a point source and in another; "
-                "give each region a group of its own (groups=)"
+                "give each region one of its own, in a dict by region"
             )
         ((singular, _),) = touched
         return Condition("condition", residual=lambda u, x, *more: c.residual(_Whole(u, singular.at), x, *more))

@@ -8,13 +8,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jsmitsm.discretization.health import LEBESGUE
 from jsmitsm.discretization.held_particles import held_particles
 from jsmitsm.discretization.layout import sorted_classes
 from jsmitsm.discretization.leave_one_out import with_held
 from jsmitsm.discretization.regions.layout import Regions, discretize_regions
 from jsmitsm.discretization.regions.rows import region_numbers, whole_coefficients
+from jsmitsm.runtime.errors import SolveError
 from jsmitsm.runtime.progress import bar
 from jsmitsm.runtime.tracers import concrete, is_traced
+from jsmitsm.solution.estimate import HIGH, TRUSTED, between_orders, lower
 from jsmitsm.solution.fit import Recipe
 from jsmitsm.solution.regions.run import RegionsRun
 from jsmitsm.taylor.multi_indices import HIGHEST, multi_indices
@@ -58,27 +61,40 @@ class RegionsFit:
 
     @bar("error estimate")
     def error_estimate(self, values: Any) -> Any:
-        """The distance (N,) or (N, F) to the solution of order p + 2."""
-        order = self.recipe.order + 2
-        if order > HIGHEST:
+        """The distance (N,) or (N, F) to the solution of order p + 2, or towards a lower one (see ``_doubted`` of the
+        estimate in one region) where rows of that order are weak or a region is too small for them."""
+        order, below = self.recipe.order, lower(self.recipe.order, max(self.recipe.operator_orders))
+        if order + 2 > HIGHEST:
             raise ValueError(
-                f"error_estimate: needs expansions of order p + 2 = {order}, and {HIGHEST} is the highest; solve at "
-                f"order {HIGHEST - 2} or below, or compare with the solution on a finer cloud"
+                f"error_estimate: needs expansions of order p + 2 = {order + 2}, and {HIGHEST} is the highest; solve "
+                f"at order {HIGHEST - 2} or below, or compare with the solution on a finer cloud"
             )
         if concrete(self.cloud.points) is None or is_traced(self.cloud.points):
             raise ValueError(
                 "error_estimate: the points are traced by a JAX transform, and the wider stencils it needs are found "
                 "on the host; ask for it outside the transform"
             )
+        try:
+            error, weakest = self._towards(order + 2, values)
+        except (SolveError, ValueError):
+            if below == order:
+                raise
+            error, weakest = self._towards(below, values)[0], 0.0
+        if order >= HIGH and below < order and LEBESGUE < TRUSTED * weakest and not is_traced(error):
+            error = between_orders(error, self._towards(below, values)[0], values)
+        return abs(error[:, 0] if self.recipe.fields == 1 else error)
+
+    def _towards(self, order: int, values: Any) -> tuple[Any, float]:
+        """What leads to the solution of another order, (N, F), and by how much its rows amplify errors at the most."""
         regions = discretize_regions(self.problem, self.cloud, order, self.recipe.depth)
         run, taylor = RegionsRun(regions, "auto", True, True, self.recipe.formulation), self.taylor
         if taylor is not None:
-            more = len(multi_indices(regions.rec.dim, regions.rec.reach)) - taylor.shape[2]
-            taylor = (jnp if is_traced(taylor) else np).pad(taylor, ((0, 0), (0, 0), (0, more)))
+            size = len(multi_indices(regions.rec.dim, regions.rec.reach))
+            more = ((0, 0), (0, 0), (0, max(0, size - taylor.shape[2])))
+            taylor = (jnp if is_traced(taylor) else np).pad(taylor, more)[:, :, :size]
         nums = run.numbers(taylor)
-        reference = with_held(regions, nums, run.solved(*run.assembled(nums), balanced=False)[0])  # type: ignore[arg-type]
-        error = abs(reference - values)
-        return error[:, 0] if regions.rec.fields == 1 else error
+        found = with_held(regions, nums, run.solved(*run.assembled(nums), balanced=False)[0])  # type: ignore[arg-type]
+        return found - values, 1.0 if run.health is None else run.health.largest
 
     def tree_flatten(self):
         return (self.problem, self.cloud, self.neighbours, self.taylor), self.recipe

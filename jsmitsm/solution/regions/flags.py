@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from jsmitsm.cloud.regions.region_cloud import RegionCloud
 from jsmitsm.discretization.regions.layout import Meeting, Regions
 from jsmitsm.runtime.errors import some
 from jsmitsm.solution.look.sizes import scales
@@ -19,6 +20,8 @@ POWER, PART = 0.75, 0.02
 # ... unless quadratic polynomials leave less than this of the change in the nearest ring: unlike ways are no power.
 # Measured with jittered particles: r^0.39 leaves 0.17 to 0.3 of it, r^0.67 0.1 to 0.2, exp(r / 3) up to 0.07.
 SMOOTH = 0.08
+# The next pairs on an interface that are looked at for corners, in each dimension.
+_BESIDE = {2: 2, 3: 6}
 # The rings, in distances of the nearest neighbour.
 _RINGS = (1.6, 3.2)
 
@@ -46,7 +49,7 @@ def singular(regions: Regions, values: np.ndarray) -> list[str]:
         return []
     points, scale = np.asarray(regions.points, float), scales(values)
     found = []
-    for m in _corners(regions, points):
+    for m in _corners(regions):
         power, part = _growth(regions, m, points, values / scale)
         if power < POWER and part > PART:
             found.append((part, power, m.copies[0]))
@@ -60,22 +63,30 @@ def singular(regions: Regions, values: np.ndarray) -> list[str]:
     ]
 
 
-def _corners(regions: Regions, points: np.ndarray) -> list[Meeting]:
-    """Meetings of three regions or more, and single pairs whose normal is not that of the next ones."""
-    out = [m for m in regions.meetings if len(m.parts) > 2]
-    for name, pairs in regions.cloud.interfaces.items():
-        normals = np.asarray(regions.cloud.interface_normals[name], float)
-        if len(pairs) < 4:
-            continue
-        from scipy.spatial import cKDTree
+def _corners(regions: Regions) -> list[Meeting]:
+    """Meetings of three regions or more, and single pairs at corners of their interface."""
+    single = {m.pairs[0]: m for m in regions.meetings if len(m.pairs) == 1}
+    several = [m for m in regions.meetings if len(m.parts) > 2]
+    return several + [single[c] for c in corners(regions.cloud) if c in single]
 
-        at = points[pairs[:, 0]]
-        away, near = cKDTree(at).query(at, k=3)
-        turn = np.einsum("pkd,pd->pk", normals[near[:, 1:]], normals).min(axis=1)
-        # A curve turns by a part of a radian between particles, a corner by more on both sides.
-        sharp = np.flatnonzero(turn < np.cos(np.radians(20.0)))
-        single = {m.pairs[0]: m for m in regions.meetings if len(m.pairs) == 1}
-        out += [single[name, int(k)] for k in sharp if (name, int(k)) in single]
+
+def corners(cloud: RegionCloud) -> list[tuple[str, int]]:
+    """The pairs of each interface that lie at or beside a corner of it; curves have none, however coarse."""
+    from scipy.spatial import cKDTree
+
+    points, out = np.asarray(cloud.points, float), []
+    for name, pairs in cloud.interfaces.items():
+        at, normals = points[pairs[:, 0]], np.asarray(cloud.interface_normals[name], float)
+        beside = _BESIDE[at.shape[1]]
+        if len(pairs) <= beside:
+            continue
+        near = cKDTree(at).query(at, k=beside + 1)[1][:, 1:]
+        way, own, other = at[near] - at[:, None], normals[:, None], normals[near]
+        turned = (own * other).sum(axis=2) < np.cos(np.radians(20.0))
+        # The chord of an arc meets both normals at one angle, the side of a corner that of the side at a right one.
+        rise, fall = (way * own).sum(axis=2), (way * other).sum(axis=2)
+        bent = np.abs(rise + fall) > 0.5 * (np.abs(rise) + np.abs(fall))
+        out += [(name, int(k)) for k in np.flatnonzero((turned & bent).any(axis=1))]
     return out
 
 

@@ -29,6 +29,7 @@ from jsmitsm.discretization.regions.rows import (
 )
 from jsmitsm.discretization.regions.squares import of_rows, squared_blocks, squared_entries, squared_rows
 from jsmitsm.discretization.rows import all_rows
+from jsmitsm.discretization.supports import scheme_size
 from jsmitsm.linear.linsolve import Factor
 from jsmitsm.particle.moments import Row
 from jsmitsm.runtime.tracers import is_traced
@@ -43,6 +44,8 @@ from jsmitsm.solution.run import Run
 # and 10 predicted values are 2 to 15 times as accurate; from 20 to 200 they are 4 to 100 times less accurate, but with
 # slip up to 9 times more.
 CARRIED = 20.0
+# A region of fewer particles than this many times the free coefficients has hardly a neighbour that tells it anything.
+SMALL = 1.5
 
 
 class RegionsRun(Run):
@@ -59,6 +62,17 @@ class RegionsRun(Run):
         # The form that was asked for, and the regions that take least squares; once they do they stay with it.
         self._missed: np.ndarray | None = None
         self.form, self.squared = form, set(p.name for p in disc.parts if form == "lsq")
+
+    def fail(self, message: str, particles: Any = ()) -> None:
+        if "is a condition missing" in message:
+            count = {p.name: (len(p.ids), scheme_size(p.disc.scheme)) for p in self.disc.parts}
+            for name, (n, free) in count.items():
+                if n < SMALL * free:
+                    message += (
+                        f" Or the region {name!r} is too small for this order: {n} particles for {free} free "
+                        "coefficients; reduce the spacing there, or lower the order"
+                    )
+        super().fail(message, particles)
 
     def numbers(self, taylor: Any = None) -> RegionNumbers:
         return region_numbers(self.disc, taylor)
