@@ -332,15 +332,15 @@ def test_a_curved_surface_has_no_corners_however_coarse():
         assert bool(len(corners(cloud))) == some
 
 
-def test_a_region_too_small_for_the_next_order_is_estimated_by_the_one_below():
+def test_a_region_too_small_for_the_next_order_is_told_by_the_one_below():
     dot = js.sdf.circle((0.0, 0.0), 0.2)
     cloud = js.regions({"a": dot, "b": js.sdf.difference(js.sdf.rectangle(*BOX), dot)}, BOX, 0.16)
     exact = {"a": lambda x: jnp.exp(x[0]) * jnp.cos(x[1]), "b": lambda x: jnp.exp(x[0]) * jnp.cos(x[1])}
     bcs = {"boundary": js.dirichlet(exact["b"]), "a|b": js.interface(conduction({"a": 1.0, "b": 1.0}))}
     sol = js.solve(js.Problem(dict.fromkeys("ab", laplace), bcs), cloud)
     off = np.abs(sol.u - values(cloud, exact)).max()
-    # The solution of order 3 is farther off than that of order 4.
-    assert off < sol.error_estimate().max() < 20 * off and sol.flags == []
+    # Ten particles hardly bind the nine free coefficients of order 4: a third is wrong there, and said to be.
+    assert off > 0.1 and 0.5 < sol.error_estimate().max() / off < 2.0 and sol.flags
 
 
 def test_only_powers_are_singular():

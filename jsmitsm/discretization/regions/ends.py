@@ -32,9 +32,8 @@ def independent(
 
     ValueError where what follows from the others contradicts them. Under a transform that knows no numbers all count.
     """
-    if not any(own) or concrete(nums.parts[m.parts[0]].own) is None:
-        return keep
-    if any(concrete(coef) is None for coef, _ in nums.between.values()):
+    known = [regions.points, *(nums.parts[k].own for k in m.parts), *(coef for coef, _ in nums.between.values())]
+    if not any(own) or any(concrete(x) is None for x in known):
         return keep
     columns: dict[Any, int] = {}
     first = list(_carried(regions, nums, m, places, own, columns))
@@ -66,7 +65,7 @@ def independent(
             made.append((one, value))
             continue
         out[t][k] = False
-        if regions.linear and not is_traced(value, [v for _, v in made]):
+        if regions.linear:
             _check_agrees(regions, nums, m, t, one, value, made)
     return tuple(tuple(rows) for rows in out)
 
@@ -127,10 +126,12 @@ def _unit(row: dict[int, float], value: Any, size: np.ndarray) -> tuple[np.ndarr
 def _check_agrees(
     regions: Regions, nums: Any, m: Meeting, t: int, row: np.ndarray, value: Any, made: list[tuple[np.ndarray, Any]]
 ) -> None:
+    everywhere = [nums.held, *(own.given for own in nums.parts), *(v for _, v in nums.between.values())]
+    if is_traced(everywhere):
+        return
     rows, given = np.array([r for r, _ in made]), np.array([float(v) for _, v in made])
     parts = np.linalg.lstsq(rows.T, row, rcond=_FOLLOWS)[0] * given
     off = abs(float(value) - parts.sum())
-    everywhere = [nums.held, *(own.given for own in nums.parts), *(v for _, v in nums.between.values())]
     largest = max(float(np.abs(v).max(initial=0.0)) for v in everywhere)
     if off > _AGREES * max(abs(float(value)), *np.abs(parts)) + _NOTHING * largest:
         at = np.asarray(regions.points)[m.copies[0]]

@@ -217,7 +217,7 @@ def _regular(
         if not all(here.all() for _, here in touched):
             raise ValueError(
                 f"bcs[{name!r}]: a js.condition on a group that lies in a region with a point source and in another; "
-                "give each region one of its own, in a dict by region"
+                "give each region a group of its own (groups=), or one each in a dict by region"
             )
         ((singular, _),) = touched
         return Condition("condition", residual=lambda u, x, *more: c.residual(_Whole(u, singular.at), x, *more))
