@@ -74,7 +74,8 @@ def corners(cloud: RegionCloud) -> list[tuple[str, int]]:
     """The pairs of each interface that lie at or beside a corner of it; curves have none, however coarse."""
     from scipy.spatial import cKDTree
 
-    points, out = np.asarray(cloud.points, float), []
+    points = np.asarray(cloud.points, float)
+    out: list[tuple[str, int]] = []
     for name, pairs in cloud.interfaces.items():
         at, normals = points[pairs[:, 0]], np.asarray(cloud.interface_normals[name], float)
         beside = _BESIDE[at.shape[1]]
