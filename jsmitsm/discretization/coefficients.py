@@ -14,6 +14,7 @@ from jsmitsm.discretization.degenerate import Degenerate, settled
 from jsmitsm.discretization.layout import Discretization, crowded
 from jsmitsm.discretization.periodic import with_corners
 from jsmitsm.discretization.resolution.kinks import softened
+from jsmitsm.discretization.resolution.poles import Poles, without_poles
 from jsmitsm.equation.conditions import group_conditions, merged
 from jsmitsm.equation.problem import Problem
 from jsmitsm.particle.recursion import Recursion, source_rows
@@ -50,6 +51,7 @@ class Numbers:
     data: Any
     gamma: Any
     degenerate: Degenerate | None = None  # what was found where the equation degenerates
+    poles: Poles | None = None  # beside which fits took the place of series
 
     @property
     def of_matrix(self) -> list[Any]:
@@ -67,12 +69,16 @@ def numbers(disc: Discretization, problem: Problem, taylor: Any = None, everywhe
     ids = np.arange(len(disc.cloud)) if everywhere else disc.active
     here = None if taylor is None else picked(taylor, ids)
     jac, source = operator_numbers(disc, problem, picked(disc.cloud.points, ids), here)
+    poles = None
+    if disc.linear:
+        jac, source, poles = without_poles(disc, problem, ids, jac, source)
     if disc.rec.depth and disc.linear and disc.traced.source == "variable":
         source = _softened(disc, problem, ids, source)
     held = _held_values(disc)
     own_ids, own, given = _own_numbers(disc, held, taylor)
     data, gamma = _data_numbers(disc, taylor)
-    return settled(disc, problem, Numbers(ids, jac, source, own_ids, own, given, _at(disc, held), data, gamma))
+    made = Numbers(ids, jac, source, own_ids, own, given, _at(disc, held), data, gamma, poles=poles)
+    return settled(disc, problem, made)
 
 
 def _softened(disc: Discretization, problem: Problem, ids: np.ndarray, source: Any) -> Any:

@@ -182,6 +182,11 @@ class Traced:
         """Whether the source may be infinite somewhere."""
         return any(_unbounded(eqn) for eqn in self._needed(False))
 
+    @cached_property
+    def unbounded(self) -> bool:
+        """Whether the source or a coefficient may be infinite somewhere."""
+        return self.unbounded_source or any(_unbounded(eqn) for eqn in self._needed(True))
+
     def _needed(self, jac: bool) -> list[Any]:
         """The operations that the coefficients, or the source, are made by."""
         return [eqn for eqn, _ in levels(self._record.jaxpr, self._wanted(jac, not jac))]

@@ -30,7 +30,7 @@ def softened(disc: Discretization, ids: np.ndarray, source: Any, values: Any) ->
     """
     place = np.full(len(disc.cloud), -1)
     place[ids] = np.arange(len(ids))
-    classes = [(cls.ids, place[cls.ids], cls.neighbours, _owners(disc, cls)) for cls in disc.classes]
+    classes = [(cls.ids, place[cls.ids], cls.neighbours, owners(disc, cls)) for cls in disc.classes]
     row_index = disc.rec.row_index
     equations = tuple(
         (degree, tuple(k for k, (e, _) in enumerate(row_index) if e == equation))
@@ -39,10 +39,15 @@ def softened(disc: Discretization, ids: np.ndarray, source: Any, values: Any) ->
     return _softened(source, values, disc.points, classes, equations)
 
 
-def _owners(disc: Discretization, cls: Class) -> Any:
+def owners(disc: Discretization, cls: Class) -> Any:
     """Whose values the neighbours (n, w) of a class have, images' those of their particles; their own where none is."""
     xp = jnp if is_traced(cls.neighbours) else np
     return disc.images.owners(xp.where(cls.neighbours >= 0, cls.neighbours, cls.ids[:, None]))
+
+
+def offsets(points: Any, ids: Any, near: Any, xp: Any) -> Any:
+    """From particles (n,) to their neighbours (n, w), (n, w, D); none where there is no neighbour."""
+    return xp.where((near >= 0)[..., None], points[xp.where(near >= 0, near, 0)] - points[ids][:, None], 0.0)
 
 
 @partial(in_one_program, static=("equations",))
@@ -50,11 +55,11 @@ def _softened(source: Any, values: Any, points: Any, classes: list[Any], equatio
     """classes: of each one its ids, their places in the source, neighbours and owners; equations: degree and rows."""
     xp = jnp if is_traced(source, values, points, classes) else np
     source, values, points = xp.array(source), xp.asarray(values), xp.asarray(points)
-    for ids, at, near, owners in classes:
-        offset = xp.where((near >= 0)[..., None], points[xp.where(near >= 0, near, 0)] - points[ids][:, None], 0.0)
+    for ids, at, near, whose in classes:
+        offset = offsets(points, ids, near, xp)
         for there, (degree, rows) in zip(values, equations):
             some = np.array(rows)[:, None], at
-            new = _judged(offset, near >= 0, there[owners], degree, source[some], xp)
+            new = _judged(offset, near >= 0, there[whose], degree, source[some], xp)
             if xp is np:
                 source[some] = new
             else:
@@ -64,21 +69,27 @@ def _softened(source: Any, values: Any, points: Any, classes: list[Any], equatio
 
 def _judged(offset: Any, valid: Any, there: Any, degree: int, series: Any, xp: Any) -> Any:
     """The series (T, n) of one equation's source, or what is fitted to its values (n, w) at the offsets (n, w, D)."""
-    length = xp.sqrt(xp.max(xp.sum(offset**2, axis=2), axis=1))
     valid = valid & xp.isfinite(there)  # a source may be infinite on the boundary
     there = xp.where(valid, there, 0.0)
     count = xp.maximum(xp.sum(valid, axis=1), 1)
     mean = lambda x: xp.sum(xp.where(valid, x, 0.0) ** 2, axis=1) / count
     whole, last = _summed(offset, degree, series, xp)
     misled, promised = mean(whole - there), mean(last)
-    fit, missed = _fitted(offset / length[:, None, None], valid, there, xp)
+    fitted, missed = fitted_series(offset, valid, there, len(series), xp)
     size = mean(there)
     astray = (misled > MISLED**2 * promised) | (promised > DIVERGED**2 * size)
     switch = (missed < BETTER**2 * misled) & astray & (misled > FAINT**2 * size)
-    scaled = fit.T / length ** np.array([sum(c) for c in multi_indices(offset.shape[2], DEGREE)])[:, None]
-    kept = min(len(scaled), len(series))
-    fitted = xp.concatenate([scaled[:kept], xp.zeros((len(series) - kept, series.shape[1]))])
     return xp.where(switch, fitted, series)
+
+
+def fitted_series(offset: Any, valid: Any, there: Any, terms: int, xp: Any) -> tuple[Any, Any]:
+    """Series (terms, n) of quadratic functions fitted to values (n, w) at the offsets (n, w, D), and their mean square
+    misfit; valid (n, w): which of the values count."""
+    length = xp.sqrt(xp.max(xp.sum(offset**2, axis=2), axis=1))
+    fit, missed = _fitted(offset / length[:, None, None], valid, there, xp)
+    scaled = fit.T / length ** np.array([sum(c) for c in multi_indices(offset.shape[2], DEGREE)])[:, None]
+    kept = min(len(scaled), terms)
+    return xp.concatenate([scaled[:kept], xp.zeros((terms - kept, len(fit)))]), missed
 
 
 def _summed(offset: Any, degree: int, series: Any, xp: Any) -> tuple[Any, Any]:

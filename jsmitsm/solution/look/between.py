@@ -60,15 +60,15 @@ def beyond_kinks(run: Any, values: Any) -> np.ndarray | None:
     kinks, or where the problem is nonlinear.
     """
     disc, nums = run.disc, run.nums
-    if nums is None or not has_kinks(disc) or run.factor is None:
+    if nums is None or not has_kinks(disc, nums) or run.factor is None:
         return None
     left_out = out_of_series(disc, nums, run.problem, run.fitted(nums, values))
     return _made_of(run, left_out) if whole(disc).total(int(np.any(left_out.source))) else None
 
 
-def has_kinks(disc: Discretization) -> bool:
+def has_kinks(disc: Discretization, nums: Numbers) -> bool:
     """Whether series of the equation, of a nonlinear one about the solution, may end within a support."""
-    return disc.traced.kinked and disc.rec.degree >= 2
+    return (disc.traced.kinked or nums.poles is not None) and disc.rec.degree >= 2
 
 
 def out_of_series(disc: Discretization, nums: Numbers, problem: Problem, fitted: np.ndarray) -> Numbers:
@@ -78,10 +78,11 @@ def out_of_series(disc: Discretization, nums: Numbers, problem: Problem, fitted:
     """
     points, place = np.asarray(disc.points, float), _places(disc, nums)
     missed = np.zeros((disc.rec.n_rows, len(nums.ids)))
+    ways = (0.5,) if nums.poles is None else WAYS[disc.rec.dim]
     for cls in disc.classes:
         at = place[cls.ids]
         left = lambda there, offset, u=fitted[cls.ids], at=at: _left_out(disc, nums, problem, there, offset, u, at)
-        missed[np.array(disc.rec.equation_rows)[:, None], at] = _around(disc, cls, points, left)
+        missed[np.array(disc.rec.equation_rows)[:, None], at] = _around(disc, cls, points, left, ways)
     return with_source(nums, missed)
 
 
@@ -311,7 +312,7 @@ def unseen(
     traced = disc.traced
     varies = traced.source == "variable" and np.shape(nums.source)[-1] > 1
     found = [_source_left_out(disc, nums, problem, rows)] if disc.linear and varies else []
-    if (has_kinks(disc) and not (disc.linear and traced.kinked_source)) or (not disc.linear and varies):
+    if (has_kinks(disc, nums) and not (disc.linear and traced.kinked_source)) or (not disc.linear and varies):
         found.append(out_of_series(disc, nums, problem, fitted()).source)
     if not found:
         return None

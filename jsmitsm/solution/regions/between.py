@@ -34,7 +34,7 @@ def unseen(run: Any, values: np.ndarray) -> list[str]:
 
     def beyond(part: Part, own: Numbers) -> Numbers | None:
         disc = part.disc
-        return out_of_series(disc, own, disc.problem, expanded[part.ids]) if has_kinks(disc) else None
+        return out_of_series(disc, own, disc.problem, expanded[part.ids]) if has_kinks(disc, own) else None
 
     told = []
     if (between := share(_made(run, left), values)) > MISSED:
