@@ -319,7 +319,7 @@ class Modes(Copied):
                 "times, since the operator is far from self-adjoint, as strong convection makes it: the error estimate "
                 "says little; write u = exp(b . x / 2) v for a drift b, or compare with a finer cloud."
             )
-        return explained(out)
+        return explained(out + self._known("flags").poles())
 
     def _part(self) -> np.ndarray:
         """The estimated errors (k,) relative to the values, or to a part of the largest, where those are small."""

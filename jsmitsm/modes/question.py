@@ -14,6 +14,7 @@ from jsmitsm.discretization.pencil.assemble import Pencil, assemble_pencil
 from jsmitsm.discretization.pencil.sparse import Sparse
 from jsmitsm.discretization.regions.layout import Regions
 from jsmitsm.discretization.regions.pencil import assemble_regions_pencil
+from jsmitsm.discretization.resolution.poles import poles_of
 from jsmitsm.equation.problem import Problem
 from jsmitsm.equation.traced import Traced
 from jsmitsm.modes.mass import weighted
@@ -54,6 +55,10 @@ class Question:
                     less, most = 0, float(np.abs(self.weights[ids, e]).max())
                 out = min(out, size * number ** (m - less) / most) if most else out
         return out
+
+    def poles(self) -> list[str]:
+        """Of coefficients that are infinite between the particles: no estimate knows that modes have cusps there."""
+        return [line for disc, _ in operators(self.pencil) for line in poles_of(disc)]
 
 
 def _leading(record: Traced, e: int, disc: Discretization) -> tuple[int, float]:

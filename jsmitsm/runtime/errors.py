@@ -38,6 +38,7 @@ SYMPTOMS = {
     "Between the particles boundary data": "data",
     "The equation is not the same": "seam",
     "changes its sign": "turned",
+    "is infinite at x =": "poles",
     "do not settle in Newton's method": "unsettled",
     "do not reach their nearest neighbours": "unmet",
     "The estimated error is": "estimate",

@@ -378,6 +378,11 @@ def _far_away(run: Any, values: np.ndarray, nums: Any, out: list[str], found: di
         )
 
 
+def _poles(run: Any, values: np.ndarray, nums: Any, out: list[str], found: dict[str, float]) -> None:
+    if nums.poles is not None:
+        out.append(nums.poles.said())
+
+
 def unsettled(run: Any, values: np.ndarray, nums: Any, out: list[str], found: dict[str, float]) -> None:
     """Several polynomials may fit a particle equally well, and its values be right: the estimate knows."""
     found["unsettled"] = count = len(run.unsettled)
@@ -388,7 +393,8 @@ def unsettled(run: Any, values: np.ndarray, nums: Any, out: list[str], found: di
         )
 
 
-DOUBTS = (_condition, _misfit, _waves, _roughness, _source, _coefficients, _weakness, _peclet, _turned, unsettled)
+DOUBTS = (_condition, _misfit, _waves, _roughness, _source, _coefficients, _weakness, _peclet, _turned, _poles,
+          unsettled)  # fmt: skip
 # The tests that ask the whole system, and those that ask one region of several alone.
 OF_THE_WHOLE = (_round_off, _condition, _far_away)
-OF_A_REGION = (_jumps, _contradictions, _misfit, _waves, _roughness, _coefficients, _peclet, _turned)
+OF_A_REGION = (_jumps, _contradictions, _misfit, _waves, _roughness, _coefficients, _peclet, _turned, _poles)

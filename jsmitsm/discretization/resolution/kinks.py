@@ -30,7 +30,7 @@ def softened(disc: Discretization, ids: np.ndarray, source: Any, values: Any) ->
     """
     place = np.full(len(disc.cloud), -1)
     place[ids] = np.arange(len(ids))
-    classes = [(cls.ids, place[cls.ids], cls.neighbours, owners(disc, cls)) for cls in disc.classes]
+    classes = [(cls.ids, place[cls.ids], cls.neighbours, _owners(disc, cls)) for cls in disc.classes]
     row_index = disc.rec.row_index
     equations = tuple(
         (degree, tuple(k for k, (e, _) in enumerate(row_index) if e == equation))
@@ -39,7 +39,7 @@ def softened(disc: Discretization, ids: np.ndarray, source: Any, values: Any) ->
     return _softened(source, values, disc.points, classes, equations)
 
 
-def owners(disc: Discretization, cls: Class) -> Any:
+def _owners(disc: Discretization, cls: Class) -> Any:
     """Whose values the neighbours (n, w) of a class have, images' those of their particles; their own where none is."""
     xp = jnp if is_traced(cls.neighbours) else np
     return disc.images.owners(xp.where(cls.neighbours >= 0, cls.neighbours, cls.ids[:, None]))

@@ -8,6 +8,8 @@ solution is the true one: there everything stays.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -15,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm.discretization.layout import Discretization
-from jsmitsm.discretization.resolution.kinks import fitted_series, offsets, owners
+from jsmitsm.discretization.resolution.kinks import fitted_series, offsets
 from jsmitsm.equation.problem import Problem
 from jsmitsm.equation.traced import Traced
 from jsmitsm.runtime.tracers import concrete, is_traced
@@ -25,13 +27,41 @@ from jsmitsm.taylor.multi_indices import count, multi_indices
 PARTS, STEPS = np.array([1.0, 0.5, 2.0]), 12
 # A pole is found where this way is so small a part of the support, and met by a particle that is as near to it.
 FOUND = 1e-6
+# A value nearer to a pole than this part of the spacing is that of a place as far away: about the mean around the pole of
+# 1 / r, in 2D and 3D, over a particle's share of space.
+NEAREST = 0.3
+# What is left out beside a pole is this part of what the values around it differ from the fit, measured on sources and
+# potentials like 1 / r at several places within the spacing: from half to five times the error.
+LEFT_OUT = 0.5
 
 
 class Poles(NamedTuple):
-    """at (P, D): where something is infinite, beside the particles ids (P,), whose series were replaced."""
+    """at (P, D): where the source of an ``equation`` (P,) or its coefficient of a ``slot`` (P,), -1 for the source, is
+    infinite, beside the particles ids (P,); missed (P,): what the fits that took the place of the series leave out.
+    """
 
     at: np.ndarray
     ids: np.ndarray
+    equation: np.ndarray
+    slot: np.ndarray
+    missed: np.ndarray
+
+    def said(self) -> str:
+        """A sentence."""
+        what = "A coefficient" if (self.slot >= 0).any() else "The source"
+        return (
+            f"{what} is infinite at x = {self.at[0]}, between the particles, and the solution is not smooth there: "
+            "refine towards that point, or solve for what is left once the singular part is taken out."
+        )
+
+
+def poles_of(disc: Discretization) -> list[str]:
+    """A sentence on the poles of a linear operator's coefficients, if there are any."""
+    if not (disc.traced.unbounded and disc.linear) or disc.traced.constant:
+        return []
+    jac, _ = disc.traced.coefficients(disc.cloud.points[disc.active], disc.rec.degree, params=disc.problem.params)
+    _, _, found = without_poles(disc, disc.problem, disc.active, jac, np.zeros((disc.rec.n_rows, 1)))
+    return [] if found is None else [found.said()]
 
 
 class _Function(NamedTuple):
@@ -65,16 +95,20 @@ def without_poles(
     if any(x is None for x in numbers):
         return jac, source, None
     found = _sought(disc, problem, ids, np.asarray(concrete(jac)), np.asarray(concrete(source)))
-    for function, (_, which) in found.items():
-        there = function.at(disc.traced, problem.params, disc.cloud.points, 0)[0]
-        if function.slot is None:
-            source = _replaced(disc, ids, which, source, function.place(disc), there)
-        else:
-            jac = _replaced(disc, ids, which, jac, function.place(disc), there)
     if not found:
         return jac, source, None
+    missed = []
+    for function, (at, which) in found.items():
+        valued = partial(function.at, disc.traced, problem.params)
+        if function.slot is None:
+            source, left = _replaced(disc, ids[which], at, which, source, function.place(disc), valued)
+        else:
+            jac, left = _replaced(disc, ids[which], at, which, jac, function.place(disc), valued)
+        missed.append(left)
     at, which = (np.concatenate(x) for x in zip(*found.values()))
-    return jac, source, Poles(at, ids[which])
+    names = [(f.equation, -1 if f.slot is None else f.slot) for f, (_, some) in found.items() for _ in some]
+    equation, slot = np.array(names).T
+    return jac, source, Poles(at, ids[which], equation, slot, LEFT_OUT * np.sqrt(np.concatenate(missed)))
 
 
 def _sought(
@@ -170,24 +204,39 @@ def _between(disc: Discretization, ids: np.ndarray, at: np.ndarray, which: np.nd
     return good
 
 
-def _replaced(disc: Discretization, ids: np.ndarray, which: np.ndarray, whole: Any, place: Any, there: Any) -> Any:
-    """``whole`` (..., n) with fits to the values ``there`` (N,) for the series at ``place`` of some of the particles."""
-    xp: Any = jnp if is_traced(whole, there, disc.points) else np
-    whole, there, points = xp.array(whole), xp.asarray(there), xp.asarray(disc.points)
+def _replaced(
+    disc: Discretization, ids: np.ndarray, at: np.ndarray, which: np.ndarray, whole: Any, place: Any,
+    valued: Callable[..., Any],
+) -> tuple[Any, np.ndarray]:  # fmt: skip
+    """``whole`` (..., n) with fits in the columns ``which`` of the series at ``place``, and their mean square misfits.
+
+    ids, at: the particles (P,), and the poles (P, D) beside them; valued: makes the function's values at points.
+    """
+    points, missed = disc.points, np.zeros(len(which))
+    xp: Any = jnp if is_traced(whole, points, valued(disc.cloud.points[:1], 0)) else np
+    whole = xp.array(whole)
     *first, terms = place
     for cls in disc.classes:
-        here = which[np.isin(ids[which], cls.ids)]
+        here = np.flatnonzero(np.isin(ids, cls.ids))
         if not len(here):
             continue
-        own = np.searchsorted(cls.ids, ids[here])
-        near = np.asarray(cls.neighbours)[own]
-        values = there[owners(disc, cls)[own]]
-        valid = (near >= 0) & xp.isfinite(values)
+        near = np.asarray(cls.neighbours)[np.searchsorted(cls.ids, ids[here])]
         away = offsets(points, ids[here], near, xp)
-        new, _ = fitted_series(away, valid, xp.where(valid, values, 0.0), len(terms), xp)
-        index = (*first, terms[:, None], here)
+        values = valued(_kept_off(points[ids[here]], away, near >= 0, at[here]).reshape(-1, disc.rec.dim), 0)[0]
+        new, left = fitted_series(away, near >= 0, values.reshape(near.shape), len(terms), xp)
+        missed[here] = concrete(left)
+        index = (*first, terms[:, None], which[here])
         if xp is np:
             whole[index] = new
         else:
             whole = whole.at[index].set(new)
-    return whole
+    return whole, missed
+
+
+def _kept_off(centres: Any, away: Any, valid: np.ndarray, at: np.ndarray) -> Any:
+    """The places (n, w, D) of the neighbours of particles (n, D), none of them close to the poles (n, D)."""
+    known = np.where(valid, np.linalg.norm(concrete(away), axis=2), np.inf)
+    spacing = np.sort(known, axis=1)[:, 1 : 1 + 2 * at.shape[1]].mean(axis=1)
+    from_pole = centres[:, None] + away - at[:, None]
+    length = np.linalg.norm(concrete(from_pole), axis=2)
+    return at[:, None] + from_pole * np.maximum(1.0, NEAREST * spacing[:, None] / length)[..., None]

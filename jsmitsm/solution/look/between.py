@@ -78,11 +78,15 @@ def out_of_series(disc: Discretization, nums: Numbers, problem: Problem, fitted:
     """
     points, place = np.asarray(disc.points, float), _places(disc, nums)
     missed = np.zeros((disc.rec.n_rows, len(nums.ids)))
-    ways = (0.5,) if nums.poles is None else WAYS[disc.rec.dim]
     for cls in disc.classes:
         at = place[cls.ids]
         left = lambda there, offset, u=fitted[cls.ids], at=at: _left_out(disc, nums, problem, there, offset, u, at)
-        missed[np.array(disc.rec.equation_rows)[:, None], at] = _around(disc, cls, points, left, ways)
+        missed[np.array(disc.rec.equation_rows)[:, None], at] = _around(disc, cls, points, left)
+    for _, particle, e, slot, rest in zip(*(nums.poles or ())):
+        f, b = disc.rec.slots[slot]
+        size = 1.0 if slot < 0 else abs(fitted[particle, f, 0])
+        row, at = disc.rec.equation_rows[e], place[particle]
+        missed[row, at] = max(abs(missed[row, at]), rest * size)
     return with_source(nums, missed)
 
 
@@ -247,7 +251,7 @@ def _made_of(run: Any, nums: Numbers) -> np.ndarray:
     """The solution (N, F) of a run's system with the source and data of ``nums`` alone, its size."""
     disc = run.disc
     if run.formulation == "lsq":
-        right = least_squares(disc, nums)[3]
+        right = least_squares(disc if disc.scheme.sourced else _sourced(disc, disc.classes), nums)[3]
     else:
         right = _right(disc, nums, run.rows)
     return solved_alone(run, np.asarray(right))
@@ -258,10 +262,16 @@ def _right(disc: Discretization, nums: Numbers, made: Any) -> np.ndarray:
     classes, rows = made
     if not disc.scheme.sourced or disc.scheme.method in ("I", "II"):
         # Rows of a problem without a source lack its weights; those of I and II hold the neighbours' sources.
-        disc = replace(disc, scheme=replace(disc.scheme, sourced=True))
-        disc.classes = [replace(cls, scheme=replace(cls.scheme, sourced=True)) for cls in classes]
+        disc = _sourced(disc, classes)
         classes, rows = all_rows(disc, nums)
     return np.asarray(right_side(disc, nums, classes, rows))
+
+
+def _sourced(disc: Discretization, classes: list[Class]) -> Discretization:
+    """The same of a problem with a source."""
+    disc = replace(disc, scheme=replace(disc.scheme, sourced=True))
+    disc.classes = [replace(cls, scheme=replace(cls.scheme, sourced=True)) for cls in classes]
+    return disc
 
 
 def solved_alone(run: Any, right: np.ndarray) -> np.ndarray:
