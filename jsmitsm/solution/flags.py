@@ -28,6 +28,7 @@ from jsmitsm.discretization.operator_kind import (
 )
 from jsmitsm.discretization.parts.whole import particles, whole
 from jsmitsm.discretization.resolution.contradictions import contradictions
+from jsmitsm.discretization.resolution.poles import said
 from jsmitsm.discretization.resolution.steepness import steepness
 from jsmitsm.discretization.resolution.steepness import unseen as beyond_slopes
 from jsmitsm.discretization.rows import all_rows
@@ -379,8 +380,7 @@ def _far_away(run: Any, values: np.ndarray, nums: Any, out: list[str], found: di
 
 
 def _poles(run: Any, values: np.ndarray, nums: Any, out: list[str], found: dict[str, float]) -> None:
-    if nums.poles is not None:
-        out.append(nums.poles.said())
+    out += said(nums.poles, whole(run.disc)) if run.disc.traced.unbounded else []
 
 
 def unsettled(run: Any, values: np.ndarray, nums: Any, out: list[str], found: dict[str, float]) -> None:

@@ -95,7 +95,14 @@ class Whole:
         if self.part is None:
             return np.sort(ids)
         ids = np.asarray(ids, int)
-        return np.sort(np.concatenate(self.part.gather(self.part.number[ids[self.part.own[ids]]])))
+        return np.sort(self.together(self.part.number[ids[self.part.own[ids]]]))
+
+    def together(self, values: np.ndarray) -> np.ndarray:
+        """Arrays of all parts, one after the other; those without an entry may have any shape."""
+        if self.part is None:
+            return values
+        found = self.part.gather(values)
+        return np.concatenate([x for x in found if len(x)] or found[:1])
 
 
 ALONE = Whole()

@@ -17,19 +17,22 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm.discretization.layout import Discretization
+from jsmitsm.discretization.parts.whole import ALONE, Whole
 from jsmitsm.discretization.resolution.kinks import fitted_series, offsets
 from jsmitsm.equation.problem import Problem
 from jsmitsm.equation.traced import Traced
 from jsmitsm.runtime.tracers import concrete, is_traced
+from jsmitsm.runtime.whole_program import in_one_program
 from jsmitsm.taylor.multi_indices import count, multi_indices
 
-# v / |grad v| is the way to a pole of first order; to others it is another part of the way.
-PARTS, STEPS = np.array([1.0, 0.5, 2.0]), 12
-# A pole is found where this way is so small a part of the support, and met by a particle that is as near to it.
-FOUND = 1e-6
-# A value nearer to a pole than this part of the spacing is that of a place as far away: about the mean around the pole of
-# 1 / r, in 2D and 3D, over a particle's share of space.
-NEAREST = 0.3
+# v / |grad v| is the way to a pole of first order; to others it is another part of the way, of logarithms a small one.
+PARTS, STEPS = np.array([1.0, 0.5, 2.0, 0.25, 0.12, 0.06]), 20
+# A pole is found where this way is so small a part of the support, and of what it was: exponentials keep theirs. It is
+# met by a particle that is as near to it.
+FOUND, SHORTER = 1e-5, 1e-2
+# A value nearer to a pole than this part of the spacing is taken so far away: about the mean over a particle's share of
+# space, of 1 / r in 2D and 3D, of its root on a line.
+NEAREST = {1: 0.12, 2: 0.3, 3: 0.4}
 # What is left out beside a pole is this part of what the values around it differ from the fit, measured on sources and
 # potentials like 1 / r at several places within the spacing: from half to five times the error.
 LEFT_OUT = 0.5
@@ -46,13 +49,17 @@ class Poles(NamedTuple):
     slot: np.ndarray
     missed: np.ndarray
 
-    def said(self) -> str:
-        """A sentence."""
-        what = "A coefficient" if (self.slot >= 0).any() else "The source"
-        return (
-            f"{what} is infinite at x = {self.at[0]}, between the particles, and the solution is not smooth there: "
-            "refine towards that point, or solve for what is left once the singular part is taken out."
-        )
+
+def said(found: Poles | None, told: Whole = ALONE) -> list[str]:
+    """A sentence on poles, if there are any; ``told``: of the cloud that several processes share."""
+    at = told.together(np.zeros((0, 0)) if found is None else found.at)
+    what = "A coefficient" if told.total(0 if found is None else int((found.slot >= 0).sum())) else "The source"
+    if not len(at):
+        return []
+    return [
+        f"{what} is infinite at x = {at[0]}, between the particles, and the solution is not smooth there: refine "
+        "towards that point, or solve for what is left once the singular part is taken out."
+    ]
 
 
 def poles_of(disc: Discretization) -> list[str]:
@@ -61,7 +68,7 @@ def poles_of(disc: Discretization) -> list[str]:
         return []
     jac, _ = disc.traced.coefficients(disc.cloud.points[disc.active], disc.rec.degree, params=disc.problem.params)
     _, _, found = without_poles(disc, disc.problem, disc.active, jac, np.zeros((disc.rec.n_rows, 1)))
-    return [] if found is None else [found.said()]
+    return said(found)
 
 
 class _Function(NamedTuple):
@@ -139,7 +146,8 @@ def _varying(disc: Discretization, jac: np.ndarray, source: np.ndarray) -> list[
     """The coefficients and the sources that are not the same everywhere."""
     slots = [(e, s) for e, row in enumerate(disc.rec.pattern) for s, there in enumerate(row) if there]
     out = [_Function(*slot) for slot in slots] if jac.shape[-1] > 1 else []
-    return out + ([_Function(e, None) for e in range(len(disc.rec.degrees))] if source.shape[-1] > 1 else [])
+    sources = source.shape[-1] > 1 and not disc.traced.kinked_source  # whose series are judged by their values
+    return out + [_Function(e, None) for e in range(len(disc.rec.degrees)) if sources]
 
 
 def _reach(disc: Discretization, ids: np.ndarray) -> np.ndarray:
@@ -178,6 +186,7 @@ def _approached(
 
     at = points
     size, way = looked(at)
+    first = np.linalg.norm(way, axis=1)
     for _ in range(STEPS):
         tried = at + PARTS[:, None, None] * np.where(np.isfinite(way), way, 0.0)
         there = [looked(x) for x in tried]
@@ -188,7 +197,8 @@ def _approached(
         size = np.where(better, np.array([s for s, _ in there])[pick], size)
         way = np.where(better[:, None], np.array([w for _, w in there])[pick], way)
     left = np.linalg.norm(way, axis=1)
-    return at, (left < FOUND * reach) & (np.linalg.norm(at - points, axis=1) < reach)
+    shorter = (left < FOUND * reach) & (left < SHORTER * first)
+    return at, shorter & (np.linalg.norm(at - points, axis=1) < reach)
 
 
 def _between(disc: Discretization, ids: np.ndarray, at: np.ndarray, which: np.ndarray, inside: bool) -> np.ndarray:
@@ -212,31 +222,44 @@ def _replaced(
 
     ids, at: the particles (P,), and the poles (P, D) beside them; valued: makes the function's values at points.
     """
-    points, missed = disc.points, np.zeros(len(which))
-    xp: Any = jnp if is_traced(whole, points, valued(disc.cloud.points[:1], 0)) else np
-    whole = xp.array(whole)
-    *first, terms = place
+    missed = np.zeros(len(which))
     for cls in disc.classes:
         here = np.flatnonzero(np.isin(ids, cls.ids))
         if not len(here):
             continue
         near = np.asarray(cls.neighbours)[np.searchsorted(cls.ids, ids[here])]
-        away = offsets(points, ids[here], near, xp)
-        values = valued(_kept_off(points[ids[here]], away, near >= 0, at[here]).reshape(-1, disc.rec.dim), 0)[0]
-        new, left = fitted_series(away, near >= 0, values.reshape(near.shape), len(terms), xp)
+        away, there = _around(disc.points, ids[here], near, at[here])
+        values = valued(there, 0)[0]
+        whole, left = _with_fits(whole, place, which[here], away, near >= 0, values)
         missed[here] = concrete(left)
-        index = (*first, terms[:, None], which[here])
-        if xp is np:
-            whole[index] = new
-        else:
-            whole = whole.at[index].set(new)
     return whole, missed
 
 
-def _kept_off(centres: Any, away: Any, valid: np.ndarray, at: np.ndarray) -> Any:
-    """The places (n, w, D) of the neighbours of particles (n, D), none of them close to the poles (n, D)."""
-    known = np.where(valid, np.linalg.norm(concrete(away), axis=2), np.inf)
-    spacing = np.sort(known, axis=1)[:, 1 : 1 + 2 * at.shape[1]].mean(axis=1)
-    from_pole = centres[:, None] + away - at[:, None]
-    length = np.linalg.norm(concrete(from_pole), axis=2)
-    return at[:, None] + from_pole * np.maximum(1.0, NEAREST * spacing[:, None] / length)[..., None]
+@in_one_program
+def _with_fits(whole: Any, place: Any, columns: np.ndarray, away: Any, valid: Any, values: Any) -> tuple[Any, Any]:
+    """``whole`` with quadratic fits to the values (n w,) around in some columns, and their mean square misfits (n,)."""
+    xp: Any = jnp if is_traced(whole, away, values) else np
+    *first, terms = place
+    values = xp.asarray(values).reshape(valid.shape)
+    valid = valid & xp.isfinite(values)  # a source may be infinite at a particle that is held as well
+    new, missed = fitted_series(away, valid, xp.where(valid, values, 0.0), len(terms), xp)
+    index = (*first, terms[:, None], columns)
+    if xp is jnp:
+        return jnp.asarray(whole).at[index].set(new), missed
+    whole = np.array(whole)
+    whole[index] = new
+    return whole, missed
+
+
+@in_one_program
+def _around(points: Any, ids: np.ndarray, near: np.ndarray, at: np.ndarray) -> tuple[Any, Any]:
+    """The ways (n, w, D) from particles to their neighbours, and where these are, kept off the poles (n, D)."""
+    xp: Any = jnp if is_traced(points) else np
+    points = xp.asarray(points)
+    away = offsets(points, ids, near, xp)
+    size = lambda x: xp.sqrt(xp.maximum(xp.sum(x**2, axis=2), 1e-300))
+    dim = at.shape[1]
+    spacing = xp.sort(xp.where(near >= 0, size(away), np.inf), axis=1)[:, 1 : 1 + 2 * dim].mean(axis=1)
+    from_pole = points[ids][:, None] + away - at[:, None]
+    farther = xp.maximum(1.0, NEAREST[dim] * spacing[:, None] / size(from_pole))
+    return away, (at[:, None] + from_pole * farther[..., None]).reshape(-1, dim)
