@@ -133,7 +133,7 @@ def _sought(
             continue
         at, arrived = _approached(function, traced, params, points[which], reach[which])
         at, which = at[arrived], which[arrived]
-        if function.slot is not None and sum(disc.rec.slots[function.slot][1]):
+        if function.slot is not None and any(disc.rec.slots[function.slot][1]):
             together[which] = True
         elif len(which):
             found[function] = at, which
