@@ -284,7 +284,7 @@ class Rounds:
         if found.local is None or self.before is None:
             return 0.0
         rate = self._marks(found, cloud, spacing).rate
-        infinite = (rate < _INFINITE) & (self.data is not None and self.data.traced.unbounded_source)
+        infinite = (rate < _INFINITE) & (self.data is not None and self.data.traced.unbounded[0])
         seen = np.where(infinite, np.maximum(found.local, found.missed), found.local)
         return float(seen[rate < SLOW].max(initial=0.0)) / _ALIKE
 

@@ -83,7 +83,7 @@ def numbers(disc: Discretization, problem: Problem, taylor: Any = None, everywhe
 
 def _softened(disc: Discretization, problem: Problem, ids: np.ndarray, source: Any) -> Any:
     """The source's series without those that mislead, beside kinks and around points where a source is infinite."""
-    if not (disc.traced.kinked_source or disc.traced.unbounded_source):
+    if not (disc.traced.kinked_source or disc.traced.unbounded[0]):
         return source
     at = lambda x: -disc.traced.residuals(x, params=problem.params)
     points, values = disc.cloud.points, at(disc.cloud.points)

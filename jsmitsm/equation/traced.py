@@ -178,14 +178,10 @@ class Traced:
         return source, operator
 
     @cached_property
-    def unbounded_source(self) -> bool:
-        """Whether the source may be infinite somewhere."""
-        return any(_unbounded(eqn) for eqn in self._needed(False))
-
-    @cached_property
-    def unbounded(self) -> bool:
-        """Whether the source or a coefficient may be infinite somewhere."""
-        return self.unbounded_source or any(_unbounded(eqn) for eqn in self._needed(True))
+    def unbounded(self) -> tuple[bool, bool]:
+        """Whether the source may be infinite somewhere, and whether a coefficient may."""
+        source, operator = (any(_unbounded(eqn) for eqn in self._needed(jac)) for jac in (False, True))
+        return source, operator
 
     def _needed(self, jac: bool) -> list[Any]:
         """The operations that the coefficients, or the source, are made by."""

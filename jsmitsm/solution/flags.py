@@ -380,7 +380,7 @@ def _far_away(run: Any, values: np.ndarray, nums: Any, out: list[str], found: di
 
 
 def _poles(run: Any, values: np.ndarray, nums: Any, out: list[str], found: dict[str, float]) -> None:
-    out += said(nums.poles, whole(run.disc)) if run.disc.traced.unbounded else []
+    out += said(nums.poles, whole(run.disc)) if any(run.disc.traced.unbounded) else []
 
 
 def unsettled(run: Any, values: np.ndarray, nums: Any, out: list[str], found: dict[str, float]) -> None:

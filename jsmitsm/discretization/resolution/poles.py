@@ -64,7 +64,7 @@ def said(found: Poles | None, told: Whole = ALONE) -> list[str]:
 
 def poles_of(disc: Discretization) -> list[str]:
     """A sentence on the poles of a linear operator's coefficients, if there are any."""
-    if not (disc.traced.unbounded and disc.linear) or disc.traced.constant:
+    if not (disc.traced.unbounded[1] and disc.linear) or disc.traced.constant:
         return []
     jac, _ = disc.traced.coefficients(disc.cloud.points[disc.active], disc.rec.degree, params=disc.problem.params)
     _, _, found = without_poles(disc, disc.problem, disc.active, jac, np.zeros((disc.rec.n_rows, 1)))
@@ -96,7 +96,7 @@ def without_poles(
 
     jac (E, S, T, n), source (rows, n): of the particles ``ids``. Poles are sought where numbers are known.
     """
-    if not disc.traced.unbounded:
+    if not any(disc.traced.unbounded):
         return jac, source, None
     numbers = [concrete(x) for x in jax.tree.leaves((jac, source, disc.points, disc.traced, problem.params))]
     if any(x is None for x in numbers):

@@ -68,7 +68,7 @@ def beyond_kinks(run: Any, values: Any) -> np.ndarray | None:
 
 def has_kinks(disc: Discretization, nums: Numbers) -> bool:
     """Whether series of the equation, of a nonlinear one about the solution, may end within a support."""
-    if disc.traced.unbounded and whole(disc).total(int(nums.poles is not None)):
+    if any(disc.traced.unbounded) and whole(disc).total(int(nums.poles is not None)):
         return True
     return disc.traced.kinked and disc.rec.degree >= 2
 
