@@ -50,7 +50,8 @@ class Slab:
         """The slab of such rows, by number."""
         rows = rows[np.argsort(rows[:, 0], kind="stable")]
         number, group, place = (rows[:, k].astype(int) for k in range(3))
-        points, normals = rows[:, 3 : 3 + self.dim], rows[:, 3 + self.dim :]
+        # Copies: views would keep the rows.
+        points, normals = rows[:, 3 : 3 + self.dim].copy(), rows[:, 3 + self.dim :].copy()
         return Slab(self.names, self.count, number, points, normals, group, place, self.with_normals, self.sizes)
 
     def cloud(self) -> Cloud:

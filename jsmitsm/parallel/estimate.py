@@ -6,10 +6,10 @@ import numpy as np
 
 from jsmitsm.parallel.pencil.modes import ParallelModes, errors
 from jsmitsm.parallel.solution import ParallelSolution
-from jsmitsm.runtime.errors import explaining
+from jsmitsm.parallel.team import collective
 
 
-@explaining
+@collective
 def error_estimate(sol: ParallelSolution | ParallelModes) -> np.ndarray:
     """Estimated error |u - u_exact| at the own particles, or of eigenvalues; see ``js.Solution.error_estimate``.
 

@@ -19,9 +19,8 @@ from jsmitsm.parallel.local import Local, Settings
 from jsmitsm.parallel.shares import local_kernel, local_problem
 from jsmitsm.parallel.solution import ParallelSolution
 from jsmitsm.parallel.solving import check_asked, recipe
-from jsmitsm.parallel.team import team
+from jsmitsm.parallel.team import collective, team
 from jsmitsm.particle.kernels import Kernel
-from jsmitsm.runtime.errors import explaining
 from jsmitsm.solution.arguments import Depth
 from jsmitsm.solution.kept_matrix import refuse_other, same_matrix
 
@@ -39,7 +38,7 @@ class ParallelFactorization:
         self.system, _ = assembled(local.team, local, solver, kept=self._pieces)
         local.refuse_degenerate()
 
-    @explaining
+    @collective
     def solve(self, problem: Problem) -> ParallelSolution:
         """The solution of a problem with the same operator; source and values of conditions may differ.
 
@@ -101,7 +100,7 @@ def _places(local: Local, some: Discretization) -> np.ndarray:
     return local.place[unknowns[unknowns >= 0]] - local.first
 
 
-@explaining
+@collective
 def factorize(
     problem: Problem, cloud: Cloud | ParallelCloud, *, method: str = "S", order: int = 4, depth: Depth = "auto",
     kernel: Kernel | None = None, formulation: str = "auto", solver: str = "auto",

@@ -15,14 +15,14 @@ from jsmitsm.cloud.packing.lattice import lattice_part
 from jsmitsm.cloud.packing.octree import morton
 from jsmitsm.cloud.shapes import checked_bounds, checked_seed, from_sdf, grouped, own_normals
 from jsmitsm.parallel.distributed import ParallelCloud, Slab, placed, slab_of
-from jsmitsm.parallel.team import Team, team
-from jsmitsm.runtime.errors import explaining, short
+from jsmitsm.parallel.team import Team, collective, team
+from jsmitsm.runtime.errors import short
 
 # A graded shape of fewer particles is made whole by the first process: each part would start from all of them.
 WHOLE = 20_000
 
 
-@explaining
+@collective
 def cloud_from(make: Callable[..., Any], *arguments: Any, **options: Any) -> ParallelCloud:
     """A cloud made by all processes, each its own slab of it; or by the first one, which deals it out.
 

@@ -21,15 +21,15 @@ from jsmitsm.parallel.distributed import ParallelCloud
 from jsmitsm.parallel.local import Local
 from jsmitsm.parallel.shares import local_kernel, local_problem
 from jsmitsm.parallel.solving import solve
-from jsmitsm.parallel.team import Team
-from jsmitsm.runtime.errors import SolveError, explaining, is_one_of
+from jsmitsm.parallel.team import Team, collective
+from jsmitsm.runtime.errors import SolveError, is_one_of
 
 WRT = ("params", "points")
 # The adjoint of Newton's steps is repeated until it changes by so little, and at most so often.
 SETTLED, MOST = 1e-11, 40
 
 
-@explaining
+@collective
 def value_and_grad(
     objective: Callable[..., Any], problem: Problem, cloud: Cloud | ParallelCloud, *, wrt: str = "params",
     **options: Any,

@@ -381,7 +381,7 @@ def first_reach(mine: Slab, order: int) -> float:
     sample = points[np.linspace(0, len(points) - 1, min(len(points), 400)).astype(int)]
     from scipy.spatial import cKDTree
 
-    return FIRST * float(cKDTree(points).query(sample, k=min(size, len(points)))[0][:, -1].max())
+    return FIRST * float(cKDTree(points).query(sample, k=[min(size, len(points))])[0].max())
 
 
 class OfOwn:

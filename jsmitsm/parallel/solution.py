@@ -10,9 +10,9 @@ from jsmitsm.parallel.halo import from_box
 from jsmitsm.parallel.local import OfOwn
 from jsmitsm.parallel.look.flags import told, unseen
 from jsmitsm.parallel.look.towards import corrected
-from jsmitsm.parallel.team import Team, team
+from jsmitsm.parallel.team import Team, collective, team
 from jsmitsm.runtime.arrays import ArrayLike
-from jsmitsm.runtime.errors import SolveError, explained, explaining, is_one_of
+from jsmitsm.runtime.errors import SolveError, explained, is_one_of
 from jsmitsm.runtime.tracers import frozen
 from jsmitsm.solution.evaluation import checked_points
 from jsmitsm.solution.fit import Recipe
@@ -118,7 +118,7 @@ class ParallelSolution(OfOwn):
                 f"method={self._recipe.method!r}, order={self._recipe.order})")  # fmt: skip
 
 
-@explaining
+@collective
 def norm(values: ArrayLike, kind: str = "max") -> float:
     """A norm of values of which every process has its own.
 
@@ -144,8 +144,8 @@ def norm(values: ArrayLike, kind: str = "max") -> float:
     ``error = jp.norm(sol.u - exact(sol.points))``
     """
     us = team()
-    own = np.abs(np.asarray(values))
     with us.phase():
+        own = np.abs(np.asarray(values))
         if not is_one_of(kind, ("max", "rms")):
             raise ValueError(f"kind: {kind!r} is none of 'max', 'rms'")
     if kind == "max":
@@ -154,7 +154,7 @@ def norm(values: ArrayLike, kind: str = "max") -> float:
     return float(np.sqrt(total / max(count, 1)))
 
 
-@explaining
+@collective
 def evaluate(sol: ParallelSolution, points: ArrayLike, multi_index: tuple[int, ...] | None = None, *,
              outside: str = "nan") -> np.ndarray:  # fmt: skip
     """Values or a derivative anywhere: every process asks for points of its own choice.

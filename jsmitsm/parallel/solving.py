@@ -17,16 +17,16 @@ from jsmitsm.parallel.local import Local, Settings
 from jsmitsm.parallel.newton import newton
 from jsmitsm.parallel.solution import ParallelSolution
 from jsmitsm.parallel.system import SOLVERS, ways
-from jsmitsm.parallel.team import Team, team
+from jsmitsm.parallel.team import Team, collective, team
 from jsmitsm.particle.kernels import Kernel
 from jsmitsm.runtime.arrays import ValueOrFunction
-from jsmitsm.runtime.errors import did_you_mean, explaining, is_one_of
+from jsmitsm.runtime.errors import did_you_mean, is_one_of
 from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.solution.arguments import Depth, check
 from jsmitsm.solution.fit import Recipe
 
 
-@explaining
+@collective
 def solve(
     problem: Problem, cloud: Cloud | ParallelCloud, *, method: str = "S", order: int = 4, depth: Depth = "auto",
     kernel: Kernel | None = None, formulation: str = "auto", solver: str = "auto", u0: ValueOrFunction | None = None,

@@ -8,15 +8,18 @@ import multiprocessing
 import os
 import sys
 import time
-from functools import cache
+from collections.abc import Callable
+from functools import cache, wraps
 from importlib import import_module
 from importlib.util import find_spec
 from types import TracebackType
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
-from jsmitsm.runtime.errors import SolveError, some
+from jsmitsm.runtime.errors import SolveError, explaining, some
+
+_Function = TypeVar("_Function", bound=Callable[..., Any])
 
 # Seconds that the others leave the first process for the message.
 PATIENCE = 5.0
@@ -60,15 +63,27 @@ class Team:
 
     def __init__(self, comm: Any):
         self.comm, self.rank, self.size = comm, comm.Get_rank(), comm.Get_size()
+        self.calls = 0  # of public functions, by which all are seen to be in the same one
 
     def gather(self, value: Any) -> list[Any]:
         """The values of all processes, in their order; raises where one of them failed instead of coming here."""
-        found = self.comm.allgather((None, value))
-        failed = [(rank, fault) for rank, (fault, _) in enumerate(found) if fault is not None]
+        found = self.meet(None, value)
+        failed = [(rank, fault) for rank, (fault, _, _) in enumerate(found) if fault is not None]
         if failed:
             rank, (kind, text, particles) = failed[0]
             raise _as_told(kind, f"{text} (on process {rank} of {self.size})", particles)
-        return [value for _, value in found]
+        calls = [call for _, call, _ in found]
+        if min(calls) < max(calls):
+            raise _as_told(
+                "SolveError",
+                f"process {calls.index(max(calls))} of {self.size} has gone on to another call, after an error of its "
+                "own or without the others; all must call the same functions in the same order",
+            )
+        return [value for _, _, value in found]
+
+    def meet(self, fault: Any, value: Any = None) -> list[Any]:
+        """What every process says: its fault, the call it is in, a value."""
+        return self.comm.allgather((fault, self.calls, value))
 
     def total(self, array: Any) -> Any:
         """The sum over all processes."""
@@ -116,11 +131,11 @@ class Phase:
                 error.args = (f"{error.args[0]}; its numbers are those of the part of process {self.team.rank}, in the "
                               f"whole cloud they are {some(error.particles)}",)  # fmt: skip
             what = "SolveError" if isinstance(error, SolveError) else type(error).__name__
-            self.team.comm.allgather(((what, str(error), getattr(error, "particles", ())), None))
+            self.team.meet((what, str(error), getattr(error, "particles", ())))
             error.told = True  # type: ignore[attr-defined]
 
 
-def _as_told(kind: str, text: str, particles: tuple[int, ...]) -> Exception:
+def _as_told(kind: str, text: str, particles: tuple[int, ...] = ()) -> Exception:
     known: dict[str, type[Exception]] = {"ValueError": ValueError, "ImportError": ImportError, "TypeError": TypeError}
     error = known[kind](text) if kind in known else Elsewhere(text, particles)
     error.told = True  # type: ignore[attr-defined]
@@ -137,6 +152,18 @@ def team() -> Team:
     if found.size > 1:
         end_together()
     return found
+
+
+def collective(function: _Function) -> _Function:
+    """``@collective``: a public function that all processes call together, explained as by ``@explaining``."""
+    explained = explaining(function)
+
+    @wraps(function)
+    def counted(*args: Any, **options: Any) -> Any:
+        team().calls += 1
+        return explained(*args, **options)
+
+    return counted  # type: ignore[return-value]
 
 
 def launched_with_others() -> bool:
@@ -169,5 +196,5 @@ def _leave() -> None:
     if engine("mpi4py.MPI").Is_finalized():
         return
     us = team()
-    while any(fault != LEFT for fault, _ in us.comm.allgather((LEFT, None))):
+    while any(fault != LEFT for fault, _, _ in us.meet(LEFT)):
         pass

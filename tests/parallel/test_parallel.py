@@ -133,16 +133,24 @@ def test_parts_of_a_shape_are_the_whole(found):
 
 
 def test_what_ends_one_ends_all():
-    """Runs at a time, whose second process falls, leaves, or works while the other waits for it in MPI."""
+    """Runs at a time, whose second process falls, leaves, works while the other waits in MPI, or goes on without it."""
     start = "import jsmitsm.parallel as jp, mpi4py.MPI as m, time, sys\nif m.COMM_WORLD.rank: "
     fails = begun(2, "-c", start + "raise RuntimeError('the second one fell')\njp.norm([1.0])")
     leaves = begun(2, "-c", start + "jp.norm([1.0]); sys.exit(0)\njp.norm([1.0]); jp.norm([2.0])")
+    drifts = begun(2, "-c", "\n".join([
+        "from jsmitsm.parallel.team import collective, team",
+        "def meets(fails): 1 / (not fails); return team().gather(1)",
+        "try: collective(meets)(team().rank == 1)",
+        "except ZeroDivisionError: pass",
+        "collective(meets)(False)",
+    ]))  # fmt: skip
     waits = begun(2, "-c", start + "print('begun', flush=True); time.sleep(600)\njp.norm([1.0])")
     assert waits.stdout.readline().strip() == "begun"
     waits.send_signal(signal.SIGINT)  # what Ctrl-C sends
     assert waits.wait(timeout=60) != 0
     for run, words in ((fails, ("the second one fell", "process 1 of 2 ends them all")),
-                       (leaves, ("the script ended, while other processes go on", "on process 1 of 2"))):  # fmt: skip
+                       (leaves, ("the script ended, while other processes go on", "on process 1 of 2")),
+                       (drifts, ("process 1 of 2 has gone on to another call",))):  # fmt: skip
         _, said = run.communicate(timeout=120)
         assert run.returncode != 0
         assert all(some in said for some in words), said

@@ -10,15 +10,14 @@ import numpy as np
 
 from jsmitsm.cloud.cloud import INTERIOR
 from jsmitsm.parallel.distributed import ParallelCloud, Slab, own_slab, placed, slab_of
-from jsmitsm.parallel.team import Team, team
-from jsmitsm.runtime.errors import explaining
+from jsmitsm.parallel.team import Team, collective, team
 from jsmitsm.show.files import from_mesh
 from jsmitsm.show.mesh_files import needed
 
 _HDF5 = (".h5", ".hdf5", ".hdf")
 
 
-@explaining
+@collective
 def read(
     points: str | os.PathLike[str], groups: Any = None, normals: Any = None, *, names: Mapping[str, int] | None = None,
     tags: str | None = None,

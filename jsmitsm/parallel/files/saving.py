@@ -12,16 +12,15 @@ from jsmitsm.parallel.files.mesh import CELLS, Piece, piece_of
 from jsmitsm.parallel.files.xdmf import write_xdmf
 from jsmitsm.parallel.local import Local
 from jsmitsm.parallel.solution import ParallelSolution
-from jsmitsm.parallel.team import Team
+from jsmitsm.parallel.team import Team, collective
 from jsmitsm.runtime.arrays import ArrayLike
-from jsmitsm.runtime.errors import explaining
 from jsmitsm.show.mesh_files import needed
 
 # Names that a file has of its own.
 _TAKEN = ("points", "cells", "groups", "normals", "number")
 
 
-@explaining
+@collective
 def save(sol: ParallelSolution, path: str | os.PathLike[str], **more: ArrayLike) -> None:
     """Write a solution for ParaView, every process its part.
 

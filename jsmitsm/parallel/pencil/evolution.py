@@ -16,9 +16,9 @@ from jsmitsm.parallel.local import OfOwn, Settings
 from jsmitsm.parallel.pencil.run import ParallelRun, TimedLocal
 from jsmitsm.parallel.pencil.space import OwnSystem
 from jsmitsm.parallel.solving import refuse_others, refuse_traced
-from jsmitsm.parallel.team import team
+from jsmitsm.parallel.team import collective, team
 from jsmitsm.runtime.arrays import ValueOrFunction
-from jsmitsm.runtime.errors import SolveError, did_you_mean, explained, explaining, is_one_of
+from jsmitsm.runtime.errors import SolveError, did_you_mean, explained, is_one_of
 from jsmitsm.runtime.progress import bar
 
 # Schemes that are made for several processes.
@@ -55,7 +55,7 @@ class ParallelEvolution(OfOwn):
         return f"ParallelEvolution({len(self.t)} times, {self.u.shape[1]} of {self._local.mine.count} particles here)"
 
 
-@explaining
+@collective
 def evolve(
     problem: Problem, cloud: Cloud | ParallelCloud, u0: ValueOrFunction | tuple[ValueOrFunction, ValueOrFunction],
     t: tuple[float, float], *, steps: int | None = None, tol: float | None = None, order: int = 4, scheme: str = "auto",

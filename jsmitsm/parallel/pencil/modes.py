@@ -18,9 +18,9 @@ from jsmitsm.parallel.local import Local, OfOwn, Settings
 from jsmitsm.parallel.pencil.assemble import own_rows, pencil_of_part
 from jsmitsm.parallel.solving import check_asked
 from jsmitsm.parallel.system import product
-from jsmitsm.parallel.team import Team, engine, team
+from jsmitsm.parallel.team import Team, collective, engine, team
 from jsmitsm.runtime.arrays import ValueOrFunction
-from jsmitsm.runtime.errors import SolveError, explaining
+from jsmitsm.runtime.errors import SolveError
 from jsmitsm.solution.arguments import Depth
 
 # Values sought beyond those asked for, the residual that ends the search, and its longest.
@@ -63,7 +63,7 @@ class ParallelModes(OfOwn):
         return f"ParallelModes({len(self)} of {self._local.mine.count} particles, {len(self._u)} of them here)"
 
 
-@explaining
+@collective
 def eigen(
     problem: Problem, cloud: Cloud | ParallelCloud, count: int, *, near: float = 0.0,
     mass: ValueOrFunction | None = None, order: int = 6, depth: Depth = "auto",
