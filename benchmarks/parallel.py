@@ -28,6 +28,8 @@ ORDER, JITTER = 4, 0.3
 # Particles along an axis of the cloud that is dealt out; to so many parts; neighbours that a row of the matrix has.
 DEALT, PARTS, WIDTH = 64, (1, 2, 4, 8, 16, 32, 64), 40
 SIDES = ("left", "right", "bottom", "top", "front", "back")
+# Of the time of a solve, what a process with a core of its own computes at least.
+ALONE = 0.8
 # Dimension, particles along an axis of the clouds whose iterations are counted.
 COUNTED = ((2, 40), (2, 126), (2, 400), (3, 18), (3, 29), (3, 62))
 
@@ -150,15 +152,16 @@ def solved(count: int, folder: str, dim: int = 3, solver: str = "auto") -> dict[
     give_back()
     before = memory("VmRSS")
     Path("/proc/self/clear_refs").write_text("5")
-    began = time.perf_counter()
+    began, busy = time.perf_counter(), time.process_time()
     names = {name: k for k, name in enumerate(("interior", *sides))}
     cloud = jp.read(f"{folder}/points.npy", f"{folder}/groups.npy", names=names)
     sol = jp.solve(problem, cloud, order=ORDER, solver=solver)
     seconds, peak = time.perf_counter() - began, memory("VmHWM")
+    busy = (time.process_time() - busy) / seconds
     error = jp.norm(sol.u - np.asarray(jax.vmap(exact)(sol.points)))
     return {
         "particles": count**dim, "unknowns": sol.stats["linear"]["unknowns"], "processes": us.size,
-        "seconds": seconds, "phases": sol.stats["seconds"],
+        "seconds": seconds, "busy": us.gather(busy), "phases": sol.stats["seconds"],
         "iterations": sol.stats["linear"]["iterations"], "solver": sol.stats["linear"]["solver"], "error": error,
         "backward_error": sol.stats["linear"]["residual"], "ghosts": us.gather(sol.stats["ghosts"]),
         "own": us.gather(len(sol.numbers)), "before": us.gather(before), "peak": us.gather(peak),
@@ -200,9 +203,12 @@ def keep(what: str, rows: list[dict[str, Any]]) -> None:
 
 
 def table_of_solves(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Without the seconds of processes that did not have a core each."""
+    alone = [min(row.get("busy", [1.0])) > ALONE for row in rows]
     cells = [
-        [f"{row['particles']:,}", row["solver"], f"{row['seconds']:.3g}", f"{row['phases']['solve']:.2g}",
-         row["iterations"], f"{max(row['a_particle']) / 1e3:.2f}", f"{row['error']:.1e}"] for row in rows
+        [f"{row['particles']:,}", row["solver"], f"{row['seconds']:.3g}" if own else "",
+         f"{row['phases']['solve']:.2g}" if own else "", row["iterations"], f"{max(row['a_particle']) / 1e3:.2f}",
+         f"{row['error']:.1e}"] for row, own in zip(rows, alone)
     ]  # fmt: skip
     columns = ["particles", "solver", "seconds", "of which the solver", "iterations", "peak, kB a particle",
                "largest error"]  # fmt: skip
