@@ -21,8 +21,8 @@ from jsmitsm.runtime.errors import SolveError, explaining, some
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
-# Seconds that the others leave the first process for the message.
-PATIENCE = 5.0
+# Seconds that the others leave the first process for the message, and that the launcher has to pass it on.
+PATIENCE, PASSED_ON = 5.0, 0.5
 # Where launchers say how many processes they started: Open MPI's, MPICH's and Intel's, MVAPICH's, Slurm's.
 LAUNCHED = ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "MV2_COMM_WORLD_SIZE", "SLURM_STEP_NUM_TASKS")
 # What a process that left the script tells those that go on with it.
@@ -185,6 +185,7 @@ def end_together() -> None:
         world = engine("mpi4py.MPI").COMM_WORLD
         if world.Get_size() > 1:
             print(f"process {world.Get_rank()} of {world.Get_size()} ends them all", file=sys.stderr, flush=True)
+            time.sleep(PASSED_ON)
             world.Abort(1)
 
     sys.excepthook = stop
