@@ -154,8 +154,9 @@ def _reach(disc: Discretization, ids: np.ndarray) -> np.ndarray:
     """How far the supports of the particles reach, (n,); 0: a particle has none."""
     points, out = np.asarray(concrete(disc.points), float), np.zeros(len(disc.cloud))
     for cls in disc.classes:
-        away = offsets(points, cls.ids, np.asarray(cls.neighbours), np)
-        out[cls.ids] = np.sqrt(np.square(away).sum(axis=2).max(axis=1))
+        for near in np.asarray(cls.neighbours).T:  # one after the other: all at once are as large as the rows
+            away = points[np.where(near >= 0, near, cls.ids)] - points[cls.ids]
+            out[cls.ids] = np.maximum(out[cls.ids], np.linalg.norm(away, axis=1))
     return out[ids]
 
 
