@@ -137,9 +137,10 @@ def _sought(
             together[which] = True
         elif len(which):
             found[function] = at, which
-    between = {f: _between(disc, ids, at, which, f.slot is not None) & ~together[which]
-               for f, (at, which) in found.items()}  # fmt: skip
-    return {f: (at[between[f]], which[between[f]]) for f, (at, which) in found.items() if between[f].any()}
+    for function, (at, which) in list(found.items()):
+        good = _between(disc, ids[which], at, function.slot is not None) & ~together[which]
+        found[function] = at[good], which[good]
+    return {function: where for function, where in found.items() if len(where[1])}
 
 
 def _varying(disc: Discretization, jac: np.ndarray, source: np.ndarray) -> list[_Function]:
@@ -174,41 +175,43 @@ def _ending(series: np.ndarray, degree: int, dim: int, reach: np.ndarray) -> np.
 def _approached(
     function: _Function, traced: Traced, params: Any, points: np.ndarray, reach: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Where |v| leads to from points (m, D), Newton's method for 1 / v = 0, and whether it is infinite there, within
-    the support."""
+    """Where |v| leads to from points (m, D) by Newton's method for 1 / v = 0, and whether it is infinite there.
+
+    Poles outside of the support are none.
+    """
 
     def looked(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """|v| (m,) and the way to a pole of first order (m, D), none where v is infinite."""
+        """|v| (...,) and the way to a pole of first order (..., D), none where v is infinite."""
         with np.errstate(all="ignore"):
-            value, *slope = np.asarray(function.at(traced, params, x, 1), float)
+            value, *slope = np.asarray(function.at(traced, params, x.reshape(-1, x.shape[-1]), 1), float)
             way = value * np.array(slope) / np.square(slope).sum(axis=0)
         infinite = ~np.isfinite(value)
-        return np.where(infinite, np.inf, np.abs(value)), np.where(infinite, 0.0, way).T
+        size = np.where(infinite, np.inf, np.abs(value))
+        return size.reshape(x.shape[:-1]), np.where(infinite, 0.0, way).T.reshape(x.shape)
 
     at = points
     size, way = looked(at)
     first = np.linalg.norm(way, axis=1)
     for _ in range(STEPS):
         tried = at + PARTS[:, None, None] * np.where(np.isfinite(way), way, 0.0)
-        there = [looked(x) for x in tried]
-        best = np.argmax([s for s, _ in there], axis=0)
-        pick = best, np.arange(len(at))
-        better = np.array([s for s, _ in there])[pick] > size
-        at = np.where(better[:, None], tried[pick], at)
-        size = np.where(better, np.array([s for s, _ in there])[pick], size)
-        way = np.where(better[:, None], np.array([w for _, w in there])[pick], way)
+        sizes, ways = looked(tried)
+        best = sizes.argmax(axis=0), np.arange(len(at))
+        better = sizes[best] > size
+        size = np.where(better, sizes[best], size)
+        at, way = (np.where(better[:, None], new[best], old) for new, old in ((tried, at), (ways, way)))
     left = np.linalg.norm(way, axis=1)
     shorter = (left < FOUND * reach) & (left < SHORTER * first)
     return at, shorter & (np.linalg.norm(at - points, axis=1) < reach)
 
 
-def _between(disc: Discretization, ids: np.ndarray, at: np.ndarray, which: np.ndarray, inside: bool) -> np.ndarray:
-    """Whether no particle meets the poles ``at`` (P, D); ``inside``: and the cloud goes on behind them."""
-    points, good = np.asarray(concrete(disc.points), float), np.zeros(len(which), bool)
+def _between(disc: Discretization, ids: np.ndarray, at: np.ndarray, inside: bool) -> np.ndarray:
+    """Whether no particle meets the poles ``at`` (P, D) beside particles (P,); ``inside``: and the cloud goes on behind
+    them."""
+    points, good = np.asarray(concrete(disc.points), float), np.zeros(len(ids), bool)
     for cls in disc.classes:
-        here = np.flatnonzero(np.isin(ids[which], cls.ids))
-        near = np.asarray(cls.neighbours)[np.searchsorted(cls.ids, ids[which[here]])]
-        away = points[np.where(near >= 0, near, ids[which[here]][:, None])] - at[here][:, None]
+        here = np.flatnonzero(np.isin(ids, cls.ids))
+        near = np.asarray(cls.neighbours)[np.searchsorted(cls.ids, ids[here])]
+        away = points[np.where(near >= 0, near, ids[here][:, None])] - at[here][:, None]
         length = np.linalg.norm(away, axis=2)
         behind = np.einsum("nwd,nd->nw", away, away[:, 0]) < 0  # the particle itself is the first
         good[here] = (length.min(axis=1) > FOUND * length.max(axis=1)) & (behind.any(axis=1) | (not inside))

@@ -85,8 +85,7 @@ def out_of_series(disc: Discretization, nums: Numbers, problem: Problem, fitted:
         left = lambda there, offset, u=fitted[cls.ids], at=at: _left_out(disc, nums, problem, there, offset, u, at)
         missed[np.array(disc.rec.equation_rows)[:, None], at] = _around(disc, cls, points, left)
     for _, particle, e, slot, rest in zip(*(nums.poles or ())):
-        f, b = disc.rec.slots[slot]
-        size = 1.0 if slot < 0 else abs(fitted[particle, f, 0])
+        size = 1.0 if slot < 0 else abs(fitted[particle, disc.rec.slots[slot][0], 0])
         row, at = disc.rec.equation_rows[e], place[particle]
         missed[row, at] = max(abs(missed[row, at]), rest * size)
     return with_source(nums, missed)
