@@ -2,12 +2,14 @@
 
 Problems at which flags have something to tell, or rows something to mend, each solved by one process and by all
 together: how far values, estimates and the weights of rows are apart, and whether the flags, the repaired stencils or
-the words of an error are the same. What differs is named, and ends the run with an error. ``NAME ...`` asks for some.
+the words of an error are the same. Where one process takes the least-squares form, which several do not make, values
+are to be within what both estimate. What differs is named, and ends the run with an error. ``NAME ...`` asks for some.
 """
 
 from __future__ import annotations
 
 import json
+import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -184,11 +186,14 @@ def apart(mine: Any, whole: Any, numbers: np.ndarray) -> float | None:
 
 def compared(one: dict[str, Any], all_: dict[str, Any]) -> dict[str, Any]:
     if "error" in one or "error" in all_:
-        return {"one": one.get("error", "solved"), "together": all_.get("error", "solved"),
-                "same": ("error" in one) == ("error" in all_)}  # fmt: skip
-    if one["form"] != "loo":  # an equation on an axis: several processes predict there too
-        return {"one": one["form"], "together": "loo", "same": True,
-                "values": apart(all_["u"], one["u"], all_["numbers"])}  # fmt: skip
+        told = [found.get("error", "solved") for found in (one, all_)]
+        words = [re.sub(r" \(on process \d+ of \d+\)$", "", text) for text in told]
+        return {"one": told[0], "together": told[1], "same": words[0] == words[1]}
+    if one["form"] != "loo":  # another system for the same equation: as near as what both are held to
+        values = apart(all_["u"], one["u"], all_["numbers"])
+        held = [jp.norm(all_["estimate"]), float(np.linalg.norm(one["estimate"]))]
+        return {"one": one["form"], "together": "loo", "values": values, "estimates": held,
+                "same": values * float(np.abs(one["u"]).max()) < sum(held)}  # fmt: skip
     values = apart(all_["u"], one["u"], all_["numbers"])
     estimate = apart(all_["estimate"], one["estimate"], all_["numbers"])
     lebesgue = abs(all_["lebesgue"] / one["lebesgue"] - 1.0)

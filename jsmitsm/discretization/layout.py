@@ -200,7 +200,8 @@ def _placed(
         return Placed(held, partner, images, n_own, walls, found, unknowns, [])
 
     given = [] if stencils is None else jax.tree.leaves(stencils)
-    if is_traced(given) or (stencils is None and kernel is not None) or sum(x.nbytes for x in given) > _LARGE:
+    large = part is not None or sum(x.nbytes for x in given) > _LARGE
+    if large or is_traced(given) or (stencils is None and kernel is not None):
         return place()
     numbers = tuple((x.shape, x.dtype.str, x.tobytes()) for x in map(np.asarray, given))
     return kept(cloud, (scheme, conditions, pairs, numbers), place)

@@ -20,6 +20,7 @@ from jsmitsm.discretization.degenerate import Degenerate, contradiction, typical
 from jsmitsm.discretization.held_particles import with_held_expansions
 from jsmitsm.discretization.layout import Class, Discretization, discretize, sorted_classes, table
 from jsmitsm.discretization.operator_kind import information_travels
+from jsmitsm.discretization.parts.stencils import InClasses
 from jsmitsm.discretization.parts.whole import Part, Whole
 from jsmitsm.discretization.rows import all_coefficients, all_rows
 from jsmitsm.equation.conditions import refuse_counts
@@ -259,8 +260,7 @@ class Local:
         """The own particles in pieces, the first time those with weak stencils repaired and last."""
         run = self.run
         repair = self.settings.repair and run.health is None and self.disc.scheme.method in ("S", "III")
-        poor: list[Class] = []
-        every: list[Class] = []
+        poor, every = list[Class](), list[Class]()
         known = [] if run.health is None else [run.health.repaired]
         told: list[health.Health] = []
         for some in _gathered(self.disc.classes):
@@ -290,7 +290,7 @@ class Local:
             known.append(found.repaired)
             every += classes
             yield self.only(classes), nums, classes, rows
-        self.disc.classes = every
+        self.disc.classes, self.disc.stencils = every, InClasses(self.disc.stencils, every)
         run.health = health.Health(
             max((one.largest for one in told), default=1.0),
             np.concatenate([np.zeros(0, int), *(one.weak for one in told)]),
@@ -360,7 +360,7 @@ def _gathered(classes: list[Class]) -> list[list[Class]]:
             if len(ids) > left:
                 pieces.append([])
                 left = AT_ONCE
-            pieces[-1].append(replace(cls, ids=ids, neighbours=near) if parts > 1 else cls)
+            pieces[-1].append(replace(cls, ids=ids.copy(), neighbours=near.copy()) if parts > 1 else cls)
             left -= len(ids)
     return pieces
 
