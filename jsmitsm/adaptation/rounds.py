@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jsmitsm.adaptation import growth
 from jsmitsm.adaptation.data import Data, data_of, unresolved
 from jsmitsm.adaptation.edges import edges
 from jsmitsm.adaptation.first_cloud import Make, farther_than_asked, made
@@ -51,13 +52,10 @@ _EASED = 1.5
 _FULL = 0.8
 # So many solves in a row may fail, each followed by one on a finer cloud.
 _REFUSED = 4
-# A cloud grows at most by this factor, small ones by more; large ones at least by the next, where so many attempts make
-# it: around a point that is refined the gradation decides.
-_GROWTH, _SMALL, _LEAST, _LARGE, _PUSHED = 5.0, {1: 400, 2: 1500, 3: 3000}, 1.5, 5000, 3
+# So many attempts are made at a cloud that grows as it should: around a refined point the gradation decides.
+_PUSHED = 3
 # The look at source and coefficients, in parts of the largest |u|; degree of the polynomials it compares with.
 _PART, _DEGREE = 0.05, 4
-# After so many rounds without a smaller error by this factor the search ends.
-_STALLED, _BETTER = 3, 0.7
 # A round before with less than this part of the last one's error is what is handed out.
 _BACK = 0.1
 # Makers leave particles so many times the spacing apart that they were asked for, and no more.
@@ -92,7 +90,7 @@ class Rounds:
         self.number_before: float | None = None
         self.flags: list[str] = []
         self.messages: list[str] = []
-        self.rows: list[tuple[int, int, float, float, float]] = []
+        self.rows: list[growth.Row] = []
         self.data: Data | None = None
         self.least, self.highest, self.shallow = 1, ORDERS[-1], False
         self.before: Marks | None = None
@@ -148,7 +146,7 @@ class Rounds:
             if number == self.max_rounds - 1:
                 self._limit(f"the {self.max_rounds} rounds that were allowed (max_rounds)")
                 return
-            if self._stalled():
+            if growth.stalled(self.rows, cloud.dim):
                 self._limit("what the cloud or round-off allow: the last rounds gained nothing")
                 return
             following = self._next(found, cloud, spacing)
@@ -261,11 +259,12 @@ class Rounds:
         if self.quantity is None and self.norm == "max" and sol.defects:
             apart = self._parts(sol, found, cloud, spacing)
         if apart is not None and found.scale > 0:
-            between = float(apart.max()) / found.scale / _GAP
-            if between > self.tol:
+            between = apart / found.scale / _GAP
+            if between.max() > self.tol:
                 self.apart = apart
-            else:
-                self.error = max(self.error, between)
+            else:  # where smoothness ends the values are off by as much
+                ends = self._marks(found, cloud, spacing).rate < SLOW
+                self.error = max(self.error, float(between[ends].max(initial=0.0)))
         self.undoubted = max(self.error, self._disagreed())
         self.error = max(self.undoubted, self._doubted(found, cloud, spacing))
         self.reached = self.error <= self.tol and not self.flags and self.apart is None
@@ -321,25 +320,20 @@ class Rounds:
             if not (np.isfinite(own) and own > _OTHERS * apart):
                 self.error = apart
 
-    def _stalled(self) -> bool:
-        errors = [row[2] for row in self.rows]
-        if len(errors) <= _STALLED or len({row[1] for row in self.rows[-_STALLED - 1 :]}) > 1:
-            return False
-        grown = self.rows[-1][0] > max(self.rows[-_STALLED][0], _SMALL[self.solution.cloud.dim])
-        return grown and min(errors[-_STALLED:]) > _BETTER * min(errors[:-_STALLED])
-
     # ------------------------------------------------------------------ the next cloud
 
     def _next(self, found: Measured, cloud: Cloud, spacing: SpacingField) -> tuple[SpacingField, Cloud] | None:
         points, h = np.asarray(cloud.points), spacing(np.asarray(cloud.points))
         power, error = self._power(cloud), self.undoubted if np.isfinite(self.undoubted) else 1e3
         apart, self.apart = self.apart, None
+        doubted = max(self.error, self._doubted(found, cloud, spacing))
+        least = growth.least(self.rows, doubted, self.tol, int(self.max_particles / 1.1))
         here = self._marks(found, cloud, spacing)
         self.before = here if np.isfinite(found.error) else None
         if len(cloud) >= _FULL * self.max_particles:
             self._limit(f"the {self.max_particles} particles that were allowed (max_particles)")
             return None
-        most = min(max(_GROWTH * len(cloud), _SMALL[cloud.dim]), self.max_particles)
+        most = growth.most(len(cloud), cloud.dim, self.max_particles)
         wanted = _EASED * self.tol if apart is not None else self.tol if self.error > self.tol else 0.5 * error
         made_h, _ = next_spacing(here, power, error, wanted, most, found.gathered)
         if apart is not None:
@@ -364,8 +358,8 @@ class Rounds:
                 continue
             if len(following) > self.max_particles:
                 field = field.scaled((1.1 * len(following) / self.max_particles) ** (1.0 / cloud.dim))
-            elif attempt < _PUSHED and apart is None and len(cloud) > _LARGE and len(following) < _LEAST * len(cloud):
-                field = field.scaled((len(following) / (1.1 * _LEAST * len(cloud))) ** (1.0 / cloud.dim))
+            elif attempt < _PUSHED and apart is None and len(following) < least:
+                field = field.scaled((len(following) / (1.1 * least)) ** (1.0 / cloud.dim))
             else:
                 break
         else:
