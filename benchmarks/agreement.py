@@ -2,8 +2,9 @@
 
 Problems at which flags have something to tell, or rows something to mend, each solved by one process and by all
 together: how far values, estimates and the weights of rows are apart, and whether the flags, the repaired stencils or
-the words of an error are the same. Where one process takes the least-squares form, which several do not make, values
-are to be within what both estimate. What differs is named, and ends the run with an error. ``NAME ...`` asks for some.
+the words of an error are the same. Where one process takes the least-squares form, which several do not make, they
+say so, or values are within what both estimate. What differs is named, and ends the run with an error. ``NAME ...``
+asks for some.
 """
 
 from __future__ import annotations
@@ -125,7 +126,7 @@ CASES: dict[str, Callable[[], Posed]] = {
     "a coefficient between particles": lambda: conducting(lambda x: 1.0 + 0.9 * jnp.sin(70.0 * x[0])),
     "a jump of the coefficient": lambda: conducting(lambda x: jnp.where(x[0] > 0.52, 10.0, 1.0)),
     "waves": lambda: scalar(lambda u, x: js.laplacian(u)(x) + 1600.0 * u(x) + 1.0),
-    "a resonance": lambda: scalar(lambda u, x: js.laplacian(u)(x) + 2.0 * np.pi**2 * u(x) + 1.0),
+    "a resonance": lambda: scalar(lambda u, x: js.laplacian(u)(x) + 2.0002 * np.pi**2 * u(x) + 1.0),
     "held by a jump": held_by_a_jump,
     "nonlinear": radiating,
     "method III": lambda: conducting(lambda x: 1.0 + 0.9 * jnp.sin(30.0 * x[0]), method="III"),
@@ -186,6 +187,8 @@ def apart(mine: Any, whole: Any, numbers: np.ndarray) -> float | None:
 
 def compared(one: dict[str, Any], all_: dict[str, Any]) -> dict[str, Any]:
     if "error" in one or "error" in all_:
+        if one.get("form", "loo") != "loo" and all_["error"].startswith("formulation:"):
+            return {"one": one["form"], "together": "refused by name", "same": True}
         told = [found.get("error", "solved") for found in (one, all_)]
         words = [re.sub(r" \(on process \d+ of \d+\)$", "", text) for text in told]
         return {"one": told[0], "together": told[1], "same": words[0] == words[1]}

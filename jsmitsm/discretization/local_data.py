@@ -16,13 +16,14 @@ from jsmitsm.particle import batches
 from jsmitsm.particle.batches import Operands
 from jsmitsm.particle.elimination import Elimination, Scheme, as_matrix, eliminate, eliminate_on_host
 from jsmitsm.particle.kernels import Kernel
+from jsmitsm.particle.moments import COMMON
 from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.runtime.whole_program import in_one_program
 
 # Bytes of an array that takes longer to copy than to be sent apart.
 _LARGE = 1 << 20
-# Lengths that share an elimination differ by less than this ratio; particles that each elimination must serve.
-_STEP, _WORTH = 1.25, 50
+# Particles that each elimination must serve.
+_WORTH = 50
 
 
 class Around(NamedTuple):
@@ -83,13 +84,13 @@ def _eliminations(disc: Discretization, nums: Numbers, cls: Class) -> tuple[Elim
     length = np.broadcast_to(np.asarray(own.length), cls.ids.shape)
     if not (length > 0).all():
         return None
-    steps, place = np.unique(np.rint(np.log(length) / np.log(_STEP)).astype(int), return_inverse=True)
+    steps, place = np.unique(np.rint(np.log(length) / np.log(COMMON)).astype(int), return_inverse=True)
     if len(cls.ids) < _WORTH * len(steps):
         return None
     disc.lengths = max(disc.lengths, len(steps))
     # One program for any number of lengths up to the next power of two.
     steps = np.concatenate([steps, np.full(max(4, 1 << (len(steps) - 1).bit_length()) - len(steps), steps[-1])])
-    lengths = float(_STEP) ** steps
+    lengths = COMMON**steps
     made = [eliminate_on_host(cls.scheme, nums.jac[..., 0], float(x)) for x in lengths]
     return Elimination(*(np.stack(part) for part in zip(*made))), lengths, place
 

@@ -63,8 +63,7 @@ class Local:
     """One process's share: a halo, the discretisation on it, and the rows of the own particles."""
 
     def __init__(self, team: Team, problem: Problem, mine: Slab, settings: Settings):
-        self.team, self.settings, self.mine = team, settings, mine
-        self.problem = problem
+        self.team, self.problem, self.settings, self.mine = team, problem, settings, mine
         self.degenerate: list[Degenerate] = []  # what was found of the equation at own particles, piece by piece
         self.boxes = boxes_of(team, mine)
         self._settle(team.most(first_reach(mine, settings.order)))
@@ -98,7 +97,6 @@ class Local:
         with self.team.phase(halo.slab.number):
             self._check_together()
             self.run = Run(self.disc, self.disc.problem, "auto", True, s.repair, "loo")
-            self.widest = self.team.largest(_widest(self.disc.classes))
         self._number()
         give_back()
         return 0.0
@@ -249,11 +247,11 @@ class Local:
             if not self.widen(missing):
                 return found
 
-    def only(self, classes: list[Class]) -> Discretization:
-        """The discretisation of the particles of some classes alone."""
+    def only(self, classes: list[Class], widest: dict[Any, int] | None = None) -> Discretization:
+        """The discretisation of the particles of some classes alone; widest: of every kind, in the whole cloud."""
         own = np.zeros(len(self.halo), bool)
         own[np.concatenate([np.zeros(0, int), *(cls.ids for cls in classes)])] = True
-        largest = lambda mine: {name: self.widest[name] for name in mine}  # noqa: E731
+        largest = lambda mine: {name: (widest or {})[name] for name in mine}  # noqa: E731
         return replace(self.disc, classes=classes, part=replace(self.part, own=own, largest=largest))
 
     def _pieces(self, taylor: Any) -> Iterator[tuple[Discretization, Numbers, list[Class], list[Row]]]:
@@ -282,8 +280,10 @@ class Local:
                 cls.kept.clear()
             del nums, classes, rows
             give_back()
+        # Only now: where an equation degenerates the classes are others than before.
+        widest = self.team.largest(_widest(every + poor)) if repair else {}
         if poor:
-            disc = self.only(poor)
+            disc = self.only(poor, widest)
             nums = self.numbers(disc, taylor)
             classes, rows, found = health.repaired(disc, nums, *all_rows(disc, nums))
             told.append(self._judged(found, nums, rows))

@@ -280,6 +280,8 @@ def _prepared(scheme, points, kernel, i, near_ids, operands: Operands, jac, own)
     """The support, elimination and conditions of one particle."""
     near = moments.support(points, i, near_ids, kernel, scheme.decay)
     if operands.shared is None:
+        if scheme.method == "S" and jac.shape[-1] == 1:
+            near = moments.at_common_length(near)
         solution = eliminate(scheme, jac, near.length)
     elif operands.lengths is not None:
         near = moments.at_length(near, operands.lengths[jac])

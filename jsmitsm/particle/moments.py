@@ -6,6 +6,7 @@ s = (x_g - x_i) / l, scaled by a length l of the support, so nothing here knows 
 
 from __future__ import annotations
 
+import math
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -27,6 +28,9 @@ from jsmitsm.particle.small_systems import (
     solve_gram,
 )
 from jsmitsm.taylor.multi_indices import multi_indices
+
+# Lengths of which the nearest stands for a particle's own, where the operator is constant, are apart by this ratio.
+COMMON = 1.25
 
 
 class Row(NamedTuple):
@@ -73,6 +77,16 @@ def support(points: Any, i: Any, neighbours: Any, kernel: Kernel | None, decay: 
 def at_length(near: Support, length: Any) -> Support:
     """The same neighbours with their offsets scaled by another length."""
     return near._replace(offset=near.offset * (near.length / length), length=length)
+
+
+def at_common_length(near: Support) -> Support:
+    """The same with the nearest of the lengths that particles have in common.
+
+    Particles share an elimination at these; one that does not is to have the same row.
+    """
+    length = jax.lax.stop_gradient(near.length)
+    steps = jnp.rint(jnp.log(jnp.where(length > 0, length, 1.0)) / math.log(COMMON))
+    return at_length(near, jnp.where(length > 0, jnp.exp(steps * math.log(COMMON)), length))
 
 
 def _fit(scheme: Scheme, weight: Any, phi: Any, tests: Any, target: Any) -> Any:
