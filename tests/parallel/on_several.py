@@ -111,7 +111,14 @@ def narrow():
 def axis():
     """On the axis x = 0 the highest derivatives have no weight, and the condition says nothing new."""
     held = {**{name: js.dirichlet(exact) for name in SIDES}, "left": js.neumann(0.0)}
-    return js.Problem(lambda u, x: x[0] * js.laplacian(u)(x) + js.partial(u, (1, 0))(x) + x[0], held), small()
+    cloud = js.rectangle((0, 0), (1, 1), (20, 20), jitter=0.2)  # of which two particles on the axis are repaired
+    return js.Problem(lambda u, x: x[0] * js.laplacian(u)(x) + js.partial(u, (1, 0))(x) + x[0], held), cloud
+
+
+def reaction():
+    """Terms of two orders: one process shares eliminations at a few lengths, of several each has too few particles."""
+    cloud = js.rectangle((0, 0), (1, 1), (14, 14), jitter=0.2)
+    return js.Problem(lambda u, x: js.laplacian(u)(x) - 400.0 * u(x), dict.fromkeys(SIDES, js.dirichlet(1.0))), cloud
 
 
 def small():
@@ -235,7 +242,8 @@ ALONE = {
     "kernel": lambda: {"u": js.solve(*graded(), **weighted_kernel(graded()[1])).u},
     "factorize": lambda: {"u": js.factorize(heated(0.0, 0.0), small(), **CHEAP).solve(heated(2.0, 0.3)).u},
     "reacting": lambda: _in_time(reacting()[0], ramps, END, **reacting()[1]),
-    "drum": _drum, "axis": lambda: {"u": js.solve(*axis(), **CHEAP).u},
+    "drum": _drum, "axis": lambda: {"u": js.solve(*axis(), order=4, depth=2).u},
+    "reaction": lambda: {"u": js.solve(*reaction(), order=4, depth=4).u},
 }  # fmt: skip
 
 
@@ -294,6 +302,7 @@ def always(found, one):
     found["own"] = COMM.allgather(len(sol.numbers))
     _files(found, sol, one["mixed"])
 
+    found["reaction"] = off(jp.solve(*reaction(), order=4, depth=4), one["reaction"])
     sol = jp.solve(*graded(), **CHEAP)
     found["graded"], found["graded rows"] = off(sol, one["graded"]), of_rows(sol, one["graded"])
     found["repaired"] = [sol.stats["repaired"].tolist(), one["graded"]["repaired"].tolist()]
@@ -357,7 +366,8 @@ def once(found, one):
     found["kernel"] = off(jp.solve(problem, cloud, **weighted_kernel(cloud)), one["kernel"])
     sol = jp.solve(*system(), **CHEAP)
     found["system"], found["gathered"] = off(sol, one["system"]), np.shape(sol.gathered())
-    found["axis"] = off(jp.solve(*axis(), **CHEAP), one["axis"])
+    sol = jp.solve(*axis(), order=4, depth=2)
+    found["axis"], found["repaired on the axis"] = off(sol, one["axis"]), len(sol.stats["repaired"])
     found["cube"] = off(jp.solve(*cube(), **CHEAP), one["cube"])
     problem, cloud = of_params()
     value, slope = jp.value_and_grad(lambda u, x, k: (u**2).sum(), problem, cloud, **CHEAP)
@@ -427,7 +437,7 @@ def _refused(cloud):
 def main(folder, whole):
     """whole: whether all is asked, or what hangs on the number of processes alone."""
     found = {}
-    one = known(folder, list(ALONE) if whole else ["mixed", "graded"])
+    one = known(folder, list(ALONE) if whole else ["mixed", "graded", "reaction"])
     always(found, one)
     if whole:
         once(found, one)

@@ -64,7 +64,7 @@ def test_rows_are_those_of_one_process(found):
 
 def test_values_are_those_of_one_process(found):
     # Round-off times the condition of a system of 400 unknowns, some 1e3.
-    for name in ("values gamg", "graded", "read"):
+    for name in ("values gamg", "graded", "read", "reaction"):
         assert found[name] < 1e-11, name
 
 
@@ -72,6 +72,7 @@ def test_so_they_are_by_other_solvers_methods_and_problems(of_two):
     for name in ("values mumps", "kernel", "III", "system", "cube", "axis"):
         assert of_two[name] < 1e-11, name
     assert of_two.get("values hypre", 0.0) < 1e-11
+    assert of_two["repaired on the axis"] == 2
 
 
 def test_particles_are_shared_evenly(found):
