@@ -326,8 +326,7 @@ class Rounds:
         points, h = np.asarray(cloud.points), spacing(np.asarray(cloud.points))
         power, error = self._power(cloud), self.undoubted if np.isfinite(self.undoubted) else 1e3
         apart, self.apart = self.apart, None
-        doubted = max(self.error, self._doubted(found, cloud, spacing))
-        least = growth.least(self.rows, doubted, self.tol, int(self.max_particles / 1.1))
+        least = growth.least(len(cloud), int(self.max_particles / 1.1))
         here = self._marks(found, cloud, spacing)
         self.before = here if np.isfinite(found.error) else None
         if len(cloud) >= _FULL * self.max_particles:
