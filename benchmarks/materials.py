@@ -119,6 +119,21 @@ def checkerboard(spacing, k=10.0):
     return cloud, js.Problem(dict.fromkeys("abcd", lambda u, x: js.laplacian(u)(x)), bcs), solution
 
 
+def checkered():
+    """Errors of the checkerboard as the spacing is halved, and the orders between them."""
+    rows = []
+    for spacing in (1 / 8, 1 / 16, 1 / 32):
+        cloud, problem, solution = checkerboard(spacing)
+        sol, right = js.solve(problem, cloud), truth(cloud, solution)
+        off = np.asarray(sol.u) - right
+        estimate = float(np.linalg.norm(sol.error_estimate()) / np.linalg.norm(off))
+        rows.append({"spacing": spacing, "error": error(np.asarray(sol.u), right), "estimate": estimate,
+                     "flags": sol.flags})  # fmt: skip
+    orders = [float(np.log2(a["error"] / b["error"])) for a, b in zip(rows, rows[1:])]
+    return {"case": "checkerboard, halved", "spacing": rows[-1]["spacing"], "order": 4, "bound": 2e-2,
+            "error": rows[-1]["error"], "orders": orders, "rows": rows}  # fmt: skip
+
+
 def sphere(spacing, k=50.0, r=0.5):
     """A ball in a uniform gradient, in a cube."""
     ball, box = js.sdf.sphere((0, 0, 0), r), ((-1,) * 3, (1,) * 3)
@@ -313,7 +328,7 @@ def main(names):
     bounds = {2: 1e-3, 4: 4e-6, 6: 1e-8, 8: 1e-10}
     runs += [("wall", lambda p=p, b=b: of_the_wall(p, b)) for p, b in bounds.items()]
     runs += [("in space", lambda p=p: in_space(p)) for p in (4, 5, 6, 8)]
-    runs += [("strip", strip), ("moved", moved), ("large", large)]
+    runs += [("checkerboard, halved", checkered), ("strip", strip), ("moved", moved), ("large", large)]
     runs += [("three layers", composite)] + [("equal", lambda p=p: equal(p)) for p in (4, 8)]
     old = json.loads(DATA.read_text())["rows"] if names and DATA.exists() else []
     rows = []

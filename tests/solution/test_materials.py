@@ -12,6 +12,7 @@ import jsmitsm as js
 from jsmitsm.discretization.regions.layout import discretize_regions
 from jsmitsm.discretization.regions.rows import joints, region_numbers
 from jsmitsm.solution.regions.flags import corners, unlike_polynomials
+from jsmitsm.solution.regions.reach import slowness
 
 BOX = ((-1.0, -1.0), (1.0, 1.0))
 DISK = js.sdf.circle((0.0, 0.0), 0.5)
@@ -341,6 +342,35 @@ def test_a_region_too_small_for_the_next_order_is_told_by_the_one_below():
     off = np.abs(sol.u - values(cloud, exact)).max()
     # Ten particles hardly bind the nine free coefficients of order 4: a third is wrong there, and said to be.
     assert off > 0.1 and 0.5 < sol.error_estimate().max() / off < 2.0 and sol.flags
+
+
+def test_the_estimate_knows_a_thin_coat_around_which_a_higher_order_gains_little():
+    """u = (c r^2 + d / r^2) cos 2 angle. Orders 4 and 6 are both off by 6e-4: their distance is an eighth of that."""
+    radii, k, coefficients = (0.6, 0.8, 1.2), {"disk": 1.0, "coat": 100.0, "rest": 1.0}, [(1.0, 0.0)]
+    for b, (k1, k2) in zip(radii, ((1.0, 100.0), (100.0, 1.0))):
+        c, d = coefficients[-1]
+        matrix, right = [[b**2, b**-2], [k2 * b, -k2 * b**-3]], [c * b**2 + d * b**-2, k1 * (c * b - d * b**-3)]
+        coefficients.append(tuple(np.linalg.solve(matrix, right)))
+    circles = [js.sdf.circle((0.0, 0.0), r) for r in radii]
+    shapes = {"disk": circles[0], "coat": js.sdf.difference(circles[1], circles[0]),
+              "rest": js.sdf.difference(circles[2], circles[1])}  # fmt: skip
+    exact = {
+        n: lambda x, c=c, d=d: (x[0] ** 2 - x[1] ** 2) * (c + (d / (x @ x) ** 2 if d else 0.0))
+        for n, (c, d) in zip(k, coefficients)
+    }
+    cloud = js.regions(shapes, ((-1.2, -1.2), (1.2, 1.2)), 0.1)
+    bcs = {i: js.interface(conduction({s: k[s] for s in i.split("|")})) for i in cloud.interfaces}
+    bcs["boundary"] = js.dirichlet(exact["rest"])
+    sol = js.solve(js.Problem(dict.fromkeys(k, laplace), bcs), cloud)
+    off = np.linalg.norm(sol.u - values(cloud, exact))
+    assert off / 3 < np.linalg.norm(sol.error_estimate()) < 10 * off and sol.flags == []
+
+
+def test_the_distance_of_two_orders_counts_more_where_their_fits_leave_alike():
+    one = np.ones(6)
+    # A half and more: up to four times. Nothing was left: as it is.
+    assert np.allclose(slowness(one, np.array([0.0, 0.2, 0.6, 1.1, 1.5, 9.0])), [1.0, 1 / 0.7, 4.0, 4.0, 2.0, 1.0])
+    assert slowness(np.zeros(1), np.ones(1)) == 1.0
 
 
 def test_only_powers_are_singular():

@@ -349,16 +349,15 @@ def whole_coefficients(regions: Regions, nums: RegionNumbers, values: Any) -> An
         found.append(all_coefficients(part.disc, own, values[part.ids]))
     out = spread(regions, found, (*regions.held.shape, regions.rec.size))
     for made in joints(regions, nums):
-        (points, each, coef), _ = _operands(regions, nums, made)
-        source, given = joint_sides(regions, nums, made)
-        data = tuple(_extended(regions.parts[k], values) for k in made.parts)
-        expanded = joint.joint_coefficients(made.scheme, points, each, coef, (data, source, given))
-        out = _placed(out, list(made.ids.T), list(expanded))
+        out = _placed(out, list(made.ids.T), list(expanded_copies(regions, nums, made, values)))
     return out
 
 
-def _extended(part: Part, values: Any) -> Any:
-    return part.disc.images.extend_values(values[part.ids])
+def expanded_copies(regions: Regions, nums: RegionNumbers, made: Joints, values: Any) -> tuple[Any, ...]:
+    """Taylor coefficients (n, F, K) of the copies on every side of the joints."""
+    (points, each, coef), _ = _operands(regions, nums, made)
+    data = tuple(regions.parts[k].disc.images.extend_values(values[regions.parts[k].ids]) for k in made.parts)
+    return joint.joint_coefficients(made.scheme, points, each, coef, (data, *joint_sides(regions, nums, made)))
 
 
 @in_one_program

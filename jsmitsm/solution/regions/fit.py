@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -13,12 +14,13 @@ from jsmitsm.discretization.held_particles import held_particles
 from jsmitsm.discretization.layout import sorted_classes
 from jsmitsm.discretization.leave_one_out import with_held
 from jsmitsm.discretization.regions.layout import Regions, discretize_regions
-from jsmitsm.discretization.regions.rows import region_numbers, whole_coefficients
+from jsmitsm.discretization.regions.rows import joint_rows, joints, region_numbers, whole_coefficients
 from jsmitsm.runtime.errors import SolveError
 from jsmitsm.runtime.progress import bar
 from jsmitsm.runtime.tracers import concrete, is_traced
 from jsmitsm.solution.estimate import HIGH, TRUSTED, between_orders, lower
 from jsmitsm.solution.fit import Recipe
+from jsmitsm.solution.regions.reach import left_by_copies, slowness
 from jsmitsm.solution.regions.run import RegionsRun
 from jsmitsm.taylor.multi_indices import HIGHEST, multi_indices
 
@@ -75,17 +77,27 @@ class RegionsFit:
                 "on the host; ask for it outside the transform"
             )
         try:
-            error, weakest = self._towards(order + 2, values)
+            error, weakest, left = self._towards(order + 2, values)
         except (SolveError, ValueError):
             if below == order:
                 raise
-            error, weakest = self._towards(below, values)[0], 0.0
+            error, weakest, left = self._towards(below, values)[0], 0.0, None
         if order >= HIGH and below < order and LEBESGUE < TRUSTED * weakest and not is_traced(error):
             error = between_orders(error, self._towards(below, values)[0], values)
+        elif left is not None and not is_traced(error):
+            error = error * slowness(self._left(values), left())
         return abs(error[:, 0] if self.recipe.fields == 1 else error)
 
-    def _towards(self, order: int, values: Any) -> tuple[Any, float]:
-        """What leads to the solution of another order, (N, F), and by how much its rows amplify errors at the most."""
+    def _left(self, values: Any) -> np.ndarray:
+        """What the copies' fits of the solution's own order leave of their neighbours' values."""
+        regions = self.discretization()
+        nums = region_numbers(regions, self.taylor)
+        bound = [(made, *joint_rows(regions, nums, made)) for made in joints(regions, nums)]
+        return left_by_copies(regions, nums, bound, np.asarray(values))
+
+    def _towards(self, order: int, values: Any) -> tuple[Any, float, Callable[[], np.ndarray]]:
+        """What leads to the solution of another order, (N, F), by how much its rows amplify errors at the most, and
+        what its copies' fits leave of their neighbours' values."""
         regions = discretize_regions(self.problem, self.cloud, order, self.recipe.depth)
         run, taylor = RegionsRun(regions, "auto", True, True, self.recipe.formulation), self.taylor
         if taylor is not None:
@@ -94,7 +106,8 @@ class RegionsFit:
             taylor = (jnp if is_traced(taylor) else np).pad(taylor, more)[:, :, :size]
         nums = run.numbers(taylor)
         found = with_held(regions, nums, run.solved(*run.assembled(nums), balanced=False)[0])  # type: ignore[arg-type]
-        return found - values, 1.0 if run.health is None else run.health.largest
+        left = lambda: left_by_copies(regions, nums, run.bound, np.asarray(found))  # noqa: E731
+        return found - values, 1.0 if run.health is None else run.health.largest, left
 
     def tree_flatten(self):
         return (self.problem, self.cloud, self.neighbours, self.taylor), self.recipe
