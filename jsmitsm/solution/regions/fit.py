@@ -76,12 +76,13 @@ class RegionsFit:
                 "error_estimate: the points are traced by a JAX transform, and the wider stencils it needs are found "
                 "on the host; ask for it outside the transform"
             )
+        left: Callable[[], np.ndarray] | None = None
         try:
             error, weakest, left = self._towards(order + 2, values)
         except (SolveError, ValueError):
             if below == order:
                 raise
-            error, weakest, left = self._towards(below, values)[0], 0.0, None
+            error, weakest = self._towards(below, values)[0], 0.0
         if order >= HIGH and below < order and LEBESGUE < TRUSTED * weakest and not is_traced(error):
             error = between_orders(error, self._towards(below, values)[0], values)
         elif left is not None and not is_traced(error):
@@ -106,7 +107,7 @@ class RegionsFit:
             taylor = (jnp if is_traced(taylor) else np).pad(taylor, more)[:, :, :size]
         nums = run.numbers(taylor)
         found = with_held(regions, nums, run.solved(*run.assembled(nums), balanced=False)[0])  # type: ignore[arg-type]
-        left = lambda: left_by_copies(regions, nums, run.bound, np.asarray(found))  # noqa: E731
+        left = lambda: left_by_copies(regions, nums, run.bound, np.asarray(found))
         return found - values, 1.0 if run.health is None else run.health.largest, left
 
     def tree_flatten(self):
