@@ -78,3 +78,17 @@ def test_what_several_regions_do_not_take_is_named():
     refused(r"pde\['b'\]: of second order in time", lambda u, x, t: js.dt(u, 2)(x) - js.laplacian(u)(x))
     refused(r"no rate in it.*\(in the region 'b'\)", lambda u, x, t: js.laplacian(u)(x))
     refused(r"u0: values for the regions \['a'\]; the cloud has \['a', 'b'\]", heat("b"), {"a": 0.0})
+
+
+def test_every_region_has_its_condition_on_one_group():
+    """The same as on a group for each end."""
+    ends = {"left": lambda x: x[:, 0] < 0.1, "right": lambda x: x[:, 0] > 0.9}
+    parted = js.regions({"a": (0.0, 0.5), "b": (0.5, 1.0)}, spacing=1 / 24, groups=ends)
+    held = js.dirichlet(lambda x, t: jnp.sin(t))
+    loses = js.condition(lambda u, x, n, t: FLUX["b"](u, x, n) + u(x) - t)
+    between = {"a|b": js.interface(FLUX)}
+    runs = [
+        js.evolve(js.Problem({n: heat(n) for n in K}, bcs | between), cloud, 0.0, t=(0.0, 0.1), steps=5, progress=False)
+        for bcs, cloud in (({"boundary": {"a": held, "b": loses}}, LAYERS), ({"left": held, "right": loses}, parted))
+    ]
+    assert np.abs(runs[0].u[-1]).max() > 0.01 and (runs[0].u == runs[1].u).all()

@@ -40,3 +40,14 @@ def test_values_of_two_layers_are_the_roots_and_their_errors_are_known():
     assert np.abs(modes.u[i] - modes.u[j]).max() < 1e-12
     with pytest.raises(ValueError, match=r"mass: given for the regions \['a'\]; the cloud has \['a', 'b'\]"):
         js.eigen(problem, LAYERS, 1, mass={"a": 1.0})
+
+
+def test_every_region_has_its_condition_on_one_group():
+    """The same as on a group for each end."""
+    ends = {"left": lambda x: x[:, 0] < 0.1, "right": lambda x: x[:, 0] > 0.9}
+    parted = js.regions({"a": (0.0, 0.5), "b": (0.5, 1.0)}, spacing=1 / 40, groups=ends)
+    held, loses = js.dirichlet(0.0), js.condition(lambda u, x, n: FLUX["b"](u, x, n) + u(x))
+    between = {"a|b": js.interface(FLUX)}
+    one = js.eigen(js.Problem(PDE, {"boundary": {"a": held, "b": loses}, **between}), LAYERS, 2, mass=HEAT)
+    two = js.eigen(js.Problem(PDE, {"left": held, "right": loses, **between}), parted, 2, mass=HEAT)
+    assert (one.values == two.values).all() and one.values[0] > 1.0
