@@ -280,7 +280,7 @@ def _prepared(scheme, points, kernel, i, near_ids, operands: Operands, jac, own)
     """The support, elimination and conditions of one particle."""
     near = moments.support(points, i, near_ids, kernel, scheme.decay)
     if operands.shared is None:
-        if scheme.method == "S" and jac.shape[-1] == 1:
+        if scheme.method == "S" and jac.shape[-1] == 1:  # of a constant operator, which others may share
             near = moments.at_common_length(near)
         solution = eliminate(scheme, jac, near.length)
     elif operands.lengths is not None:
