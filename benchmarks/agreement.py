@@ -190,7 +190,8 @@ def compared(one: dict[str, Any], all_: dict[str, Any]) -> dict[str, Any]:
         if one.get("form", "loo") != "loo" and all_["error"].startswith("formulation:"):
             return {"one": one["form"], "together": "refused by name", "same": True}
         told = [found.get("error", "solved") for found in (one, all_)]
-        words = [re.sub(r" \(on process \d+ of \d+\)$", "", text) for text in told]
+        # Of a line along which something jumps every process meets another point first.
+        words = [re.sub(r" \(on process \d+ of \d+\)$| near x = \[[^]]*\]", "", text) for text in told]
         return {"one": told[0], "together": told[1], "same": words[0] == words[1]}
     if one["form"] != "loo":  # another system for the same equation: as near as what both are held to
         values = apart(all_["u"], one["u"], all_["numbers"])
