@@ -193,12 +193,11 @@ def compared(one: dict[str, Any], all_: dict[str, Any]) -> dict[str, Any]:
         # Of a line along which something jumps every process meets another point first.
         words = [re.sub(r" \(on process \d+ of \d+\)$| near x = \[[^]]*\]", "", text) for text in told]
         return {"one": told[0], "together": told[1], "same": words[0] == words[1]}
+    values = apart(all_["u"], one["u"], all_["numbers"])
     if one["form"] != "loo":  # another system for the same equation: as near as what both are held to
-        values = apart(all_["u"], one["u"], all_["numbers"])
         held = [jp.norm(all_["estimate"]), float(np.linalg.norm(one["estimate"]))]
         return {"one": one["form"], "together": "loo", "values": values, "estimates": held,
                 "same": values * float(np.abs(one["u"]).max()) < sum(held)}  # fmt: skip
-    values = apart(all_["u"], one["u"], all_["numbers"])
     estimate = apart(all_["estimate"], one["estimate"], all_["numbers"])
     lebesgue = abs(all_["lebesgue"] / one["lebesgue"] - 1.0)
     flags, repaired = all_["flags"] == one["flags"], np.array_equal(all_["repaired"], one["repaired"])

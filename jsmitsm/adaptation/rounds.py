@@ -255,34 +255,33 @@ class Rounds:
             return False
         self._checked(sol, found, cloud, spacing)
         self.flags = sol.flags
+        rate = self._marks(found, cloud, spacing).rate
         self.apart, apart = None, None
         if self.quantity is None and self.norm == "max" and sol.defects:
-            apart = self._parts(sol, found, cloud, spacing)
+            apart = self._parts(sol, rate)
         if apart is not None and found.scale > 0:
             between = apart / found.scale / _GAP
             if between.max() > self.tol:
                 self.apart = apart
             else:  # where smoothness ends the values are off by as much
-                ends = self._marks(found, cloud, spacing).rate < SLOW
-                self.error = max(self.error, float(between[ends].max(initial=0.0)))
+                self.error = max(self.error, float(between[rate < SLOW].max(initial=0.0)))
         self.undoubted = max(self.error, self._disagreed())
-        self.error = max(self.undoubted, self._doubted(found, cloud, spacing))
+        self.error = max(self.undoubted, self._doubted(found, rate))
         self.reached = self.error <= self.tol and not self.flags and self.apart is None
         return self.reached
 
-    def _parts(self, sol: Solution, found: Measured, cloud: Cloud, spacing: SpacingField) -> np.ndarray | None:
+    def _parts(self, sol: Solution, rate: np.ndarray) -> np.ndarray | None:
         """What parts neighbours between them, or may part them from what is true, (N,)."""
-        before, values = self.before, np.asarray(sol.u).reshape(len(cloud), -1)
-        slow = None if before is None else self._marks(found, cloud, spacing).rate < SLOW
-        off = off_at_free_ends(self.problem, cloud, values, slow, None if before is None else before.points)
+        before, values = self.before, np.asarray(sol.u).reshape(len(sol.cloud), -1)
+        slow, points = (None, None) if before is None else (rate < SLOW, before.points)
+        off = off_at_free_ends(self.problem, sol.cloud, values, slow, points)
         apart = gaps(sol)
         return np.maximum(_GAP * off, 0.0 if apart is None else apart) if off.any() else apart
 
-    def _doubted(self, found: Measured, cloud: Cloud, spacing: SpacingField) -> float:
+    def _doubted(self, found: Measured, rate: np.ndarray) -> float:
         """The error where smoothness ends, of which the estimate sees a part."""
         if found.local is None or self.before is None:
             return 0.0
-        rate = self._marks(found, cloud, spacing).rate
         infinite = (rate < _INFINITE) & (self.data is not None and self.data.traced.unbounded[0])
         seen = np.where(infinite, np.maximum(found.local, found.missed), found.local)
         return float(seen[rate < SLOW].max(initial=0.0)) / _ALIKE

@@ -18,7 +18,7 @@ from jsmitsm.discretization import health
 from jsmitsm.discretization.coefficients import Numbers, numbers, slot_series
 from jsmitsm.discretization.degenerate import Degenerate, contradiction, typical
 from jsmitsm.discretization.held_particles import with_held_expansions
-from jsmitsm.discretization.layout import Class, Discretization, discretize, sorted_classes, table
+from jsmitsm.discretization.layout import Class, Discretization, discretize, sorted_classes
 from jsmitsm.discretization.operator_kind import information_travels
 from jsmitsm.discretization.parts.stencils import InClasses
 from jsmitsm.discretization.parts.whole import Part, Whole
@@ -334,7 +334,7 @@ class Local:
     def coefficients(self, values: np.ndarray, taylor: Any = None) -> np.ndarray:
         """Taylor coefficients (n, F, K) of all local particles, the borrowed ones' from their owners."""
         with self.team.phase(self.halo.slab.number):
-            near = Stencils(table(self.disc), None)
+            near = Stencils(self.disc.stencils.indices, None)
             disc = replace(self.disc, classes=sorted_classes(self.disc, self.halo.ids, near), stencils=near)
             nums = numbers(disc, disc.problem, taylor, everywhere=True)
             found = np.asarray(all_coefficients(disc, nums, values))

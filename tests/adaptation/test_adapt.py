@@ -343,17 +343,21 @@ def test_where_smoothness_ends_the_estimate_is_half_of_the_error():
     field = SpacingField(x, np.full(101, 0.01), 0.01)
     local = np.where(x[:, 0] < 0.3, 2e-4, 3e-4)  # contributions are the largest of some neighbours
     found = Measured(3e-4, np.where(rough, 1 / 1.5, 2.0**-5), 1.0, local=local)
-    assert search._doubted(found, cloud, field) == 0.0  # nobody knows a rate yet
+
+    def doubted(found):
+        return search._doubted(found, search._marks(found, cloud, field).rate)
+
+    assert doubted(found) == 0.0  # nobody knows a rate yet
     none = np.zeros(101, bool)
     search.rows = [(101, 4, 1e-2, 0.0, 0.02), (101, 4, 3e-4, 0.0, 0.01)]
     search.before = Marks(x, np.full(101, 0.02), np.ones(101), np.full(101, 5.0), none, none)
-    assert search._doubted(found, cloud, field) == pytest.approx(4e-4)
+    assert doubted(found) == pytest.approx(4e-4)
     # Of a source that is infinite there, what is seen between the particles is such a part too.
     missed = np.where(x[:, 0] < 0.05, 5e-4, 0.0)
-    assert search._doubted(replace(found, missed=missed), cloud, field) == pytest.approx(4e-4)  # a kink, perhaps
+    assert doubted(replace(found, missed=missed)) == pytest.approx(4e-4)  # a kink, perhaps
     infinite = js.Problem(lambda u, x: js.laplacian(u)(x) - x[0] ** -1.5, ends(0.0, 0.0))
     search.data = data_of(infinite, 1, 4)
-    assert search._doubted(replace(found, missed=missed), cloud, field) == pytest.approx(1e-3)
+    assert doubted(replace(found, missed=missed)) == pytest.approx(1e-3)
 
 
 # ------------------------------------------------------------------ bad input
