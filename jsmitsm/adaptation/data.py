@@ -16,7 +16,8 @@ from jsmitsm.cloud.inside import inside_of
 from jsmitsm.equation.problem import Problem
 from jsmitsm.equation.traced import Traced
 from jsmitsm.equation.tracing import trace
-from jsmitsm.taylor.multi_indices import count, multi_indices
+from jsmitsm.particle.polynomials import monomials_on_host
+from jsmitsm.taylor.multi_indices import count
 
 # Points that are asked for source and coefficients besides the cubes' own, by dimension: what is narrower than their
 # distance may be missed.
@@ -88,7 +89,7 @@ class Data:
             return Look(*np.zeros((4, len(points))))
         jac, source = self.series(points, self.degree)
         jac_there, source_there = self.series(points[which] + offsets, 0)
-        powers = np.stack([np.prod(offsets ** np.array(a), axis=1) for a in multi_indices(t.dim, self.degree)])
+        powers = monomials_on_host(offsets.T, self.degree)
         order = np.array([[sum(b) for _, b in t.slots]] * t.n_equations)
         leading = np.abs(jac[:, :, 0]) * (order == np.array(t.order)[:, None])[..., None]
         leading = np.maximum(leading.max(axis=1), 1e-300)  # (E, n)

@@ -87,6 +87,7 @@ def marks(
         rate = np.where(fresh, power, np.nanmedian(around, axis=1))
     worst = (contribution > 0) & (contribution >= contribution[near].max(axis=1)) & (rate < min(SLOW, _ROUGH * power))
     at = _middle(contribution[near], away / spacing[:, None], near, edge)[worst]
+    at = _where_known(points, spacing, at, before)
     np.minimum.at(rate, at, rate[worst])
     if before is None and edge is not None:
         # No rates yet: what stands out at an edge is taken for its end of smoothness, and one round more tells.
@@ -111,13 +112,21 @@ def _middle(contribution: np.ndarray, away: np.ndarray, near: np.ndarray, edge: 
     return np.take_along_axis(near, around.argmax(axis=1)[:, None], axis=1)[:, 0]
 
 
+def _where_known(points: np.ndarray, spacing: np.ndarray, at: np.ndarray, before: Marks | None) -> np.ndarray:
+    """The particles ``at``, beside a point found twice that point: what is rough around it is its fault."""
+    if before is None or not before.located.any() or not len(at):
+        return at
+    known = before.points[before.located]
+    away, which = cKDTree(known).query(points[at])
+    off, there = cKDTree(points).query(known)
+    beside = (away <= _AFFECTED * spacing[at]) & (off <= _SAME * spacing[there])[which]
+    return np.where(beside, there[which], at)
+
+
 def _singular(
     points: np.ndarray, spacing: np.ndarray, at: np.ndarray, before: Marks | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Where smoothness ends (N,), of the particles ``at``, and where that was found at the same point once more (N,).
-
-    What else is rough around a point found twice is its fault.
-    """
+    """Where smoothness ends (N,), of the particles ``at``, and where that was found at the same point twice (N,)."""
     singular, located = np.zeros((2, len(points)), bool)
     singular[at] = True
     if before is not None and before.singular.any() and singular.any():

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jsmitsm.particle.polynomials import monomials_on_host
 from jsmitsm.runtime.errors import SolveError, in_words
 from jsmitsm.solution.estimate import Correction
 from jsmitsm.solution.solution import Solution
@@ -124,13 +125,11 @@ def gaps(sol: Solution) -> np.ndarray | None:
     points, dim = np.asarray(sol.cloud.points), sol.cloud.dim
     near = sol.neighbours[:, 1 : 2 * dim + 1]  # those across a slit are none
     near = np.where((near >= 0) & (near < len(points)), near, np.arange(len(points))[:, None])
-    index = multi_indices(dim, sol.order + sol.depth)
+    odd = np.array([(-1.0) ** sum(a) for a in multi_indices(dim, sol.order + sol.depth)])
     worst = np.zeros(len(points))
     for k in range(near.shape[1]):
-        half = 0.5 * (points[near[:, k]] - points)
-        powers = np.stack([np.prod(half ** np.array(a), axis=1) for a in index], axis=1)
-        back = powers * np.array([(-1.0) ** sum(a) for a in index])
-        apart = np.einsum("nk,nkf->nf", powers, found) - np.einsum("nk,nkf->nf", back, found[near[:, k]])
+        powers = monomials_on_host(0.5 * (points[near[:, k]] - points).T, sol.order + sol.depth).T
+        apart = np.einsum("nk,nkf->nf", powers, found) - np.einsum("nk,nkf->nf", odd * powers, found[near[:, k]])
         worst = np.maximum(worst, np.abs(apart).max(axis=1))
     return worst if np.isfinite(worst).all() else None
 

@@ -13,7 +13,7 @@ from jsmitsm.adaptation.edges import edges
 from jsmitsm.adaptation.first_cloud import Make, farther_than_asked, made
 from jsmitsm.adaptation.free_ends import off_at_free_ends
 from jsmitsm.adaptation.layers import layers
-from jsmitsm.adaptation.marking import ROUGH, SLOW, Marks, marks, next_spacing
+from jsmitsm.adaptation.marking import FAR, ROUGH, SLOW, Marks, marks, next_spacing
 from jsmitsm.adaptation.measure import Measured, Quantity, gaps, measured, size, spent
 from jsmitsm.adaptation.spacing_field import SpacingField
 from jsmitsm.cloud.cloud import Cloud
@@ -37,6 +37,8 @@ _GAP = 10.0
 # Where smoothness ends solutions of two orders miss the same, and are nearer to each other than to what is true: the
 # distance is taken for this part of the error.
 _ALIKE = 0.5
+# Near the end of a search one aims at this part of the tolerance, if there are such points.
+_AIMED = 0.6
 # What is missed of a source between the particles is that as well, where contributions fall with less than this power:
 # there no mean over a few points tells what its infinite values make.
 _INFINITE = 1.0
@@ -333,6 +335,8 @@ class Rounds:
             return None
         most = growth.most(len(cloud), cloud.dim, self.max_particles)
         wanted = _EASED * self.tol if apart is not None else self.tol if self.error > self.tol else 0.5 * error
+        if here.singular.any() and error <= FAR * self.tol:  # the estimate will be doubted there, soon
+            wanted *= _AIMED
         made_h, _ = next_spacing(here, power, error, wanted, most, found.gathered)
         if apart is not None:
             parted = marks(points, h, apart, power, None, expected=_PARTED)
@@ -376,7 +380,8 @@ class Rounds:
         # Contributions at another order are others, in a constant at least: they tell no rate.
         comparable = len(self.rows) > 1 and self.rows[-1][1] == self.rows[-2][1] and np.isfinite(found.error)
         points, before = np.asarray(cloud.points), self.before if comparable else None
-        return marks(points, spacing(points), found.contribution, self._power(cloud), before, edges(cloud))
+        turned = edges(cloud, self.solution.neighbours)
+        return marks(points, spacing(points), found.contribution, self._power(cloud), before, turned)
 
     def _better(self, spacing: SpacingField) -> SpacingField | None:
         """The spacing of a round before that did better than the last one, over which no other may grow then."""

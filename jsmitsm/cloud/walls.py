@@ -7,40 +7,27 @@ much longer than the straight one. Round a blunt corner or a round hole it is no
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from jsmitsm.cloud.neighbours import Stencils, nearest, within
+from jsmitsm.cloud.ways import Looked, Ways
 
 # A particle is in front of another at a smaller angle (its cosine) to the normal than this.
 _FACING, _CUT = 0.5, 0.3
 # Opposite normals, and how far in front of each other (in parts of their distance) particles with such normals are.
 _OPPOSITE, _APART = -0.5, 0.003
-# A way this many times as long as the straight one, and this many spacings more, leads round something.
-_DETOUR, _SLACK = 2.0, 0.5
 # Nearest particles that are linked, and boundary particles that may cut a link, by dimension.
 _LINKS, _CUTTERS = {1: 4, 2: 12, 3: 30}, {1: 4, 2: 10, 3: 20}
 # No link is longer than so many spacings.
 _LONG = 2.3
 # What a boundary particle covers of the boundary, in its distance from the next ones.
 _COVER = {1: 1.0, 2: 0.6, 3: 0.75}
-# Of a cloud of so many particles all links are made at once. Sources of one search for shortest ways.
-_SMALL = 4000
-_CHUNK = 256
+# Of a cloud of so many particles, or where they concern this part of it, all links are made at once.
+_SMALL, _PART = 4000, 0.25
 # A boundary particle has a side: the interior ones next to it lie in one direction (the mean's length).
 _SIDED = 0.35
-
-
-class Links(NamedTuple):
-    """Particles linked to their nearest ones, without the links that leave the domain.
-
-    number (M,): of the particles in the graph, -1 for others; spacing: of the linked ones; graph: lengths.
-    """
-
-    number: np.ndarray
-    spacing: np.ndarray
-    graph: Any
 
 
 class Walls:
@@ -57,7 +44,8 @@ class Walls:
         self.points, self.ids, self.interior, self.groups = points, ids, interior, groups
         self.given = normals
         self.kept: dict[Any, np.ndarray] = {}  # what others found by looking
-        self.links: Links | None = None
+        self.ways: Ways | None = None
+        self.looked = Looked(len(points))
         self.place = np.full(len(points), -1)
         self.place[ids] = np.arange(len(ids))
 
@@ -186,30 +174,24 @@ class Walls:
 
     def _behind(self, near: np.ndarray, rows: np.ndarray) -> np.ndarray:
         """Mask (n, w) of the neighbours of some particles to which the way is long."""
-        from scipy.sparse.csgraph import dijkstra
+        new = np.flatnonzero(~self.looked.known(near, rows))
+        if len(new):
+            found = self._ways(near[new], rows[new]).long(near[new], rows[new])
+            self.looked.add(near[new], rows[new], found)
+        return self.looked.answer(rows, near.shape[1])
 
-        links = self._links(near, rows)
-        number, spacing = links.number, links.spacing
-        out = np.zeros(near.shape, bool)
-        straight = np.sqrt(((self.points[np.maximum(near, 0)] - self.points[rows][:, None]) ** 2).sum(axis=2))
-        allowed = _DETOUR * straight + _SLACK * spacing[number[rows]][:, None]
-        for k in range(0, len(rows), _CHUNK):
-            some = slice(k, k + _CHUNK)
-            limit = float(np.where(near[some] >= 0, allowed[some], 0.0).max())
-            ways = dijkstra(links.graph, directed=False, indices=number[rows[some]], limit=limit)
-            there = ways[np.arange(len(ways))[:, None], number[np.maximum(near[some], 0)]]
-            out[some] = (near[some] >= 0) & ~(there <= allowed[some])
-        return out
+    def _ways(self, near: np.ndarray, rows: np.ndarray) -> Ways:
+        """The ways among some particles and their neighbours; where these are a large part of the cloud among all,
+        once."""
+        if self.ways is None:
+            members = np.unique(np.concatenate([near[near >= 0], rows]))
+            if len(members) < _PART * len(self.points) and len(self.points) > _SMALL:
+                return self._linked(members)
+            self.ways = self._linked(np.arange(len(self.points)))
+        return self.ways
 
-    def _links(self, near: np.ndarray, rows: np.ndarray) -> Links:
-        """The links among some particles and their neighbours; those of a small cloud among all, once."""
-        if len(self.points) > _SMALL:
-            return self._linked(np.unique(np.concatenate([near[near >= 0], rows])))
-        if self.links is None:
-            self.links = self._linked(np.arange(len(self.points)))
-        return self.links
-
-    def _linked(self, members: np.ndarray) -> Links:
+    def _linked(self, members: np.ndarray) -> Ways:
+        """Particles linked to their nearest ones, without the links that leave the domain."""
         from scipy.sparse import coo_array
 
         number = np.full(len(self.points), -1)
@@ -224,7 +206,7 @@ class Walls:
         a, b, length = a[short], b[short], length[short]
         keep = ~self._cut(members[a], members[b])
         graph = coo_array((length[keep], (a[keep], b[keep])), shape=(len(at), len(at))).tocsr()
-        return Links(number, spacing, graph)
+        return Ways(self.points, number, spacing, graph)
 
     def _cut(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
         """Mask of the links between particles ``a`` and ``b`` that leave the domain."""
@@ -260,10 +242,12 @@ class Walls:
         crossing = ((one < -small) & (two > small)) | ((two < -small) & (one > small))
         cut |= crossing & ~from_a & ~from_b & (aside <= cover[near])
         # Between particles of walls that face each other, however flat the link lies.
-        ahead_a = np.where(from_a, two, -np.inf), np.where(from_b, one, -np.inf)
-        opposite = np.einsum("ekd,eld->ekl", n, n) < _OPPOSITE
-        pair = (ahead_a[0] > _APART * length)[:, :, None] & (ahead_a[1] > _APART * length)[:, None, :]
-        return (cut | (pair & opposite).any(axis=2)).any(axis=1)
+        ahead_a, ahead_b = from_a & (two > _APART * length), from_b & (one > _APART * length)
+        facing = np.flatnonzero(ahead_a.any(axis=1) & ahead_b.any(axis=1))
+        opposite = np.einsum("ekd,eld->ekl", n[facing], n[facing]) < _OPPOSITE
+        pair = ahead_a[facing][:, :, None] & ahead_b[facing][:, None, :]
+        cut[facing] |= (pair & opposite).any(axis=2)
+        return cut.any(axis=1)
 
     def _surfels(self, members: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The boundary particles among some as pieces of it: their numbers, normals, and what each covers (a radius).

@@ -173,8 +173,8 @@ def _repaired(
     return Class(ids, best.neighbours, scheme, classes[0].wide), best.row, ids[best.changed]
 
 
-# So many attempts are kept with the walls of a cloud, for the next solve on it.
-_KEPT = 16
+# So many attempts are kept with the walls of a cloud, for the next solve on it, of another order too.
+_KEPT = 32
 
 # Moment matrices are looked at so many at a time, as many as one small program serves.
 _PIECE = 128

@@ -16,7 +16,7 @@ import numpy as np
 
 from jsmitsm.particle.elimination import Deep, Elimination, Scheme, as_matrix, transposed
 from jsmitsm.particle.kernels import EDGE, Kernel, fitted
-from jsmitsm.particle.polynomials import FEW, Combinations, functionals, monomials
+from jsmitsm.particle.polynomials import FEW, Combinations, Separated, functionals, monomials
 from jsmitsm.particle.recursion import Recursion, fit_and_tail
 from jsmitsm.particle.small_systems import (
     general_inverse,
@@ -106,7 +106,7 @@ class System(NamedTuple):
     own_rows: Any  # (n_own, F K)
     own_scale: Any  # (n_own,)
     own_solve: Any  # (free, n_own)
-    values: Any  # (rows of data, F K): the data as functionals of U, an array or Combinations
+    values: Any  # (rows of data, F K): the data as functionals of U, an array or what stands for it
     phi: Any  # values @ reduced
     weight: Any  # (rows of data,)
     tests: Any  # (rows of data, free) or None
@@ -130,6 +130,8 @@ def local_system(
     plain = values is None and fields == 1 and not scheme.n_data
     if plain and rec.size <= FEW and not isinstance(solution.particular, Deep):
         values = Combinations(near.offset, rec.reach)
+    elif plain and scheme.flat and rec.depth and rec.dim < 3:
+        values = Separated(near.offset, rec.reach)  # of those beyond the fit sums alone are asked for
     else:
         p = monomials(near.offset, rec.reach)
     if values is None:
@@ -162,8 +164,13 @@ def _data_of(scheme: Scheme, near: Support, values: Any, basis: Any, plain: bool
     """
     if scheme.flat and scheme.rec.depth:
         low = fit_and_tail(scheme.rec)[0]
-        values = Combinations(near.offset, scheme.rec.order) if plain and len(low) <= FEW else values[:, low]
         basis = basis[low]
+        if plain and len(low) <= FEW:
+            values = Combinations(near.offset, scheme.rec.order)
+        elif isinstance(values, Separated):
+            values = monomials(near.offset, scheme.rec.order)
+        else:
+            values = values[:, low]
     return values @ basis if isinstance(values, Combinations) else product(values, basis)
 
 
@@ -203,6 +210,8 @@ def _lacking(system: System, wanted: Any, w: Any, matrix: Any) -> Any:
     """matrix^T (wanted^T - values^T w): what the data leave of each wanted functional of matrix's columns."""
     if isinstance(system.values, Combinations):
         return matrix.T @ wanted.T - (system.values @ matrix).T @ w
+    if isinstance(system.values, Separated):
+        return transposed(matrix, wanted.T - system.values.summed(w))
     return transposed(matrix, wanted.T - system.values.T @ w)
 
 
@@ -300,7 +309,7 @@ def _parts(scheme: Scheme, solution: Elimination, system: System) -> Any:
 def _looked_at(scheme: Scheme, ns: int, system: System, part: Any) -> Any:
     """The data (rows of data, m) of local polynomials (F K, m); a neighbour's value hangs on its own field alone."""
     fields = scheme.rec.fields
-    if fields == 1 or isinstance(system.values, Combinations):
+    if fields == 1:
         return system.values @ part
     own = system.values[: ns * fields : fields, : scheme.rec.size]
     seen = jnp.einsum("gk,fkm->gfm", own, part.reshape(fields, scheme.rec.size, -1)).reshape(ns * fields, -1)

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm.particle.recursion import Recursion
-from jsmitsm.particle.small_systems import outer_products
+from jsmitsm.particle.small_systems import outer_products, product
 from jsmitsm.taylor.multi_indices import Slot, factorial, index_of, multi_indices
 
 # Up to so many monomials their combinations are made at once.
@@ -80,6 +80,34 @@ class Combinations(NamedTuple):
         if matrix.ndim == 1:
             return (self @ matrix[:, None])[:, 0]
         return _combined(self.offset, self.order, matrix)
+
+
+class Separated(NamedTuple):
+    """What stands for ``monomials(offset, order)`` on a line or in the plane, where sums over places are asked for."""
+
+    offset: Any  # (ns, D)
+    order: int
+
+    def __matmul__(self, matrix: Any) -> Any:
+        """(ns, K) @ (K, m) or (K,)."""
+        return monomials(self.offset, self.order) @ matrix
+
+    def summed(self, weights: Any) -> Any:
+        """The transposed (K, ns) @ (ns, m): powers of x times powers of y, summed before they are multiplied out."""
+        exponents = np.array(multi_indices(self.offset.shape[1], self.order)).T
+        x, *y = (_powers(s, self.order) for s in self.offset.T)
+        if not y:
+            return product(x, weights)
+        sums = [product(x * w, y[0].T)[tuple(exponents)] for w in weights.T]
+        return jnp.stack(sums, axis=1)
+
+
+def _powers(x: Any, order: int) -> Any:
+    """1, x, x^2, ... (order + 1, n)."""
+    rows = [jnp.ones_like(x)]
+    for _ in range(order):
+        rows.append(rows[-1] * x)
+    return jnp.stack(rows)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(1,))

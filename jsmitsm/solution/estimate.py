@@ -332,7 +332,9 @@ def _of_order(
             "error_estimate: the points are traced by a JAX transform, and the wider stencils it needs are found on "
             "the host; ask for it outside the transform"
         )
-    cloud = Cloud(np.asarray(host), low.cloud.groups, low.cloud.normals)
+    # The cloud of the solve knows its walls.
+    same = not is_traced(fit.cloud.points, fit.cloud.normals)
+    cloud = fit.cloud if same else Cloud(np.asarray(host), low.cloud.groups, low.cloud.normals)
     if depth is None:
         depth = min(low.rec.depth, room(low.rec, order, low.traced, cloud, fit.problem.params))
     other = discretized(fit.problem, cloud, "S", order, depth=depth)

@@ -6,8 +6,7 @@ import numpy as np
 
 from jsmitsm.discretization.layout import Discretization
 from jsmitsm.equation.problem import Problem
-from jsmitsm.particle.polynomials import derivative_table
-from jsmitsm.taylor.multi_indices import multi_indices
+from jsmitsm.particle.polynomials import derivative_table, monomials_on_host
 
 # Places looked at on the way to a neighbour, in parts of it; the polynomial of the nearer particle is asked.
 WAY = np.arange(0.0, 1.01, 0.04)
@@ -24,11 +23,11 @@ def residual(disc: Discretization, problem: Problem, at: np.ndarray, offset: np.
 def evaluated(disc: Discretization, problem: Problem, at: np.ndarray, offset: np.ndarray, u: np.ndarray) -> tuple:
     """The same, the operator's coefficients (E, S, n) there, and what they are multiplied with (S, n)."""
     rec, traced = disc.rec, disc.traced
-    powers = np.stack([np.prod(offset ** np.array(a), axis=1) for a in multi_indices(rec.dim, rec.reach)], axis=1)
+    powers = monomials_on_host(offset.T, rec.reach)
     slots = []
     for f, b in traced.slots:
         lower, factor = derivative_table(rec.dim, rec.reach, b)
-        slots.append(np.einsum("nk,nk->n", u[:, f], powers[:, lower] * factor))
+        slots.append(np.einsum("nk,kn->n", u[:, f], powers[lower] * factor[:, None]))
     value = np.stack(slots)
     jac, source = traced.coefficients(at, 0, params=problem.params, slots=None if traced.linear else value[:, None])
     jac = np.broadcast_to(np.asarray(jac)[:, :, 0], (*np.shape(jac)[:2], len(at)))

@@ -12,7 +12,7 @@ from jsmitsm.discretization.layout import Discretization
 from jsmitsm.discretization.parts.whole import whole
 from jsmitsm.discretization.resolution.residuals import followed
 from jsmitsm.equation.problem import Problem
-from jsmitsm.taylor.multi_indices import multi_indices
+from jsmitsm.particle.polynomials import monomials_on_host
 
 # A coefficient that changes between neighbours by this part of the larger value jumps.
 JUMP = 0.5
@@ -34,7 +34,7 @@ def steepness(
     worst, steep = np.zeros(len(disc.cloud)), []
     for ids, here, there, offset in _pairs(disc, nums):
         length = np.linalg.norm(offset, axis=1) ** power[..., None]
-        t = np.stack([np.prod(offset ** np.array(a), axis=1) for a in multi_indices(rec.dim, rec.degree)])
+        t = monomials_on_host(offset.T, rec.degree)
         away = np.abs(np.einsum("estn,tn->esn", jac[..., here], t) - jac[:, :, 0, there]) * length
         size = (np.maximum(np.abs(jac[:, :, 0, there]), np.abs(jac[:, :, 0, here])) * length).max(axis=1)
         part = (away.max(axis=1) / np.where(size > 0, size, 1.0)).max(axis=0)

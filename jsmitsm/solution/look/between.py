@@ -22,6 +22,7 @@ from jsmitsm.discretization.periodic import with_corners
 from jsmitsm.discretization.resolution.residuals import evaluated, residual
 from jsmitsm.discretization.rows import all_coefficients, all_rows
 from jsmitsm.equation.problem import Problem
+from jsmitsm.particle.polynomials import monomials_on_host
 from jsmitsm.taylor.multi_indices import multi_indices
 
 # A particle of the same group so many times as far as the nearest ones of all, or whose normal has less than this part
@@ -99,7 +100,7 @@ def _left_out(
     rec = disc.rec
     residual_there, jac, value = evaluated(disc, problem, there, offset, u)
     source = np.einsum("esn,sn->en", jac, value) - residual_there  # on the right of the equation, as in the numbers
-    powers = np.stack([np.prod(offset ** np.array(c), axis=1) for c in multi_indices(rec.dim, rec.degree)])
+    powers = monomials_on_host(offset.T, rec.degree)
     degrees = np.array([sum(c) for c in multi_indices(rec.dim, rec.degree)])
 
     def ended(known: Any, series: Any, degree: int) -> np.ndarray:
@@ -342,9 +343,9 @@ def _source_left_out(disc: Discretization, nums: Numbers, problem: Problem, rows
 
         def left(there: np.ndarray, offset: np.ndarray, at: np.ndarray = at) -> np.ndarray:
             away = -np.asarray(disc.traced.residuals(there, params=problem.params))
+            powers = monomials_on_host(offset.T, disc.rec.degree)
             for e, some in enumerate(series):
-                powers = [np.prod(offset ** np.array(disc.rec.row_index[k][1]), axis=1) for k in some]
-                away[e] -= np.einsum("kn,kn->n", known[some][:, at], np.stack(powers))
+                away[e] -= np.einsum("kn,kn->n", known[some][:, at], powers[: len(some)])
             return np.where(np.isfinite(away), away, 0.0)  # infinite on the boundary
 
         missed[np.array(disc.rec.equation_rows)[:, None], at] = _around(disc, cls, points, left)

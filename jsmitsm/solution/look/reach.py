@@ -16,8 +16,8 @@ import numpy as np
 from jsmitsm.discretization.layout import Class, Discretization
 from jsmitsm.discretization.parts.whole import whole
 from jsmitsm.particle.moments import Row
+from jsmitsm.particle.polynomials import monomials_on_host
 from jsmitsm.solution.look.between import beyond_kinks, nearest_of, solved_alone
-from jsmitsm.taylor.multi_indices import multi_indices
 
 Fits = Callable[[], np.ndarray]
 # A polynomial does not reach its nearest neighbours where it misses one by this part of the largest change to any of
@@ -107,13 +107,12 @@ def missed(
     to it. plain: the mean that is left of the nearest in its place. values (N, F), fitted (N, F, K): the polynomials.
     """
     points, out = np.asarray(disc.points, float), np.zeros(disc.held.shape)
-    powers = np.array(multi_indices(disc.rec.dim, disc.rec.reach))[: fitted.shape[2]]
     at = lambda other: values[np.asarray(disc.images.owners(other))]
 
     def left(ids: np.ndarray, other: np.ndarray) -> np.ndarray:
         """What polynomials at particles (n,) leave of the values of others (n,), (n, F)."""
-        terms = np.prod((points[other] - points[ids])[:, None] ** powers, axis=2)
-        away = np.abs(np.einsum("nfk,nk->nf", fitted[ids], terms) - at(other))
+        terms = monomials_on_host((points[other] - points[ids]).T, disc.rec.reach)[: fitted.shape[2]]
+        away = np.abs(np.einsum("nfk,kn->nf", fitted[ids], terms) - at(other))
         return np.where((other != ids)[:, None], away, 0.0)
 
     for cls, row in zip(*rows):

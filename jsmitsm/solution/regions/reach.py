@@ -13,7 +13,7 @@ import numpy as np
 
 from jsmitsm.discretization.regions.layout import Regions
 from jsmitsm.discretization.regions.rows import Joints, RegionNumbers, expanded_copies
-from jsmitsm.taylor.multi_indices import multi_indices
+from jsmitsm.particle.polynomials import monomials_on_host
 
 # The next order is off by as large a part of the error as its copies' fits leave, or up to so many times that. Measured
 # on rings, coats and layers one to six spacings thin: by 0.6 to 1.9 times.
@@ -36,15 +36,16 @@ def left_by_copies(regions: Regions, nums: RegionNumbers, bound: list[Any], valu
 def _left(regions: Regions, made: Joints, near: np.ndarray, expanded: np.ndarray, values: np.ndarray) -> np.ndarray:
     """What is left of the neighbours' values (n, w, F) by the polynomials (n, M, F, K) of the copies on their sides."""
     points, rec = np.asarray(regions.points, float), regions.rec
-    powers, each = np.array(multi_indices(rec.dim, rec.reach))[: expanded.shape[3]], np.arange(len(near))
+    each = np.arange(len(near))
     side_of = np.zeros(len(points), int)
     for side, k in enumerate(made.parts):
         side_of[regions.parts[k].ids] = side
     out = np.zeros((*near.shape, rec.fields))
     for column, there in enumerate(near.T):
         side = side_of[there]  # where there is no neighbour, any
-        terms = np.prod((points[there] - points[made.ids[each, side]])[:, None] ** powers, axis=2)
-        away = np.einsum("nfk,nk->nf", expanded[each, side], terms) - values[there]
+        offset = points[there] - points[made.ids[each, side]]
+        terms = monomials_on_host(offset.T, rec.reach)[: expanded.shape[3]]
+        away = np.einsum("nfk,kn->nf", expanded[each, side], terms) - values[there]
         out[:, column] = np.where((there >= 0)[:, None], away, 0.0)
     return out
 
