@@ -174,11 +174,14 @@ class Walls:
 
     def _behind(self, near: np.ndarray, rows: np.ndarray) -> np.ndarray:
         """Mask (n, w) of the neighbours of some particles to which the way is long."""
-        new = np.flatnonzero(~self.looked.known(near, rows))
+        known, out = self.looked.known(near, rows), np.zeros(near.shape, bool)
+        if known.any():
+            out[known] = self.looked.answer(rows[known], near.shape[1])
+        new = np.flatnonzero(~known)
         if len(new):
-            found = self._ways(near[new], rows[new]).long(near[new], rows[new])
-            self.looked.add(near[new], rows[new], found)
-        return self.looked.answer(rows, near.shape[1])
+            out[new] = self._ways(near[new], rows[new]).long(near[new], rows[new])
+            self.looked.add(near[new], rows[new], out[new])
+        return out
 
     def _ways(self, near: np.ndarray, rows: np.ndarray) -> Ways:
         """The ways among some particles and their neighbours; where these are a large part of the cloud among all,

@@ -14,6 +14,8 @@ _CHUNK = 64
 # Particles whose spacings are within this ratio search together. Much finer ones than all of them and their neighbours
 # are no stations of their ways: around the tip of a crack there are thousands.
 _BAND, _FINE = 4.0, 8.0
+# Of more answers than this those before are forgotten.
+_KEPT = 20_000_000
 
 
 class Ways:
@@ -64,6 +66,10 @@ class Looked:
 
     def __init__(self, count: int):
         self.at = np.full(count, -1)
+        self._forget()
+
+    def _forget(self) -> None:
+        self.at[:] = -1
         self.near, self.behind = np.zeros((0, 0), np.int32), np.zeros((0, 0), bool)
 
     def known(self, near: np.ndarray, rows: np.ndarray) -> np.ndarray:
@@ -79,6 +85,8 @@ class Looked:
 
     def add(self, near: np.ndarray, rows: np.ndarray, behind: np.ndarray) -> None:
         """Remember it; of a particle that was looked at already what is new stands in place of the old."""
+        if (len(self.near) + len(rows)) * max(near.shape[1], self.near.shape[1]) > _KEPT:
+            self._forget()
         old, width = self.near.shape, max(near.shape[1], self.near.shape[1])
         new = np.unique(rows[self.at[rows] < 0])
         self.at[new] = old[0] + np.arange(len(new))

@@ -175,10 +175,6 @@ def _placed(
     pairs = tuple(dict.fromkeys(c.groups for cs in problem.bcs.values() for c in cs if c.kind == "periodic"))
     conditions = tuple((g.name, g.ids.tobytes(), tuple(g.held), g.n_rows) for g in groups)
 
-    def boundary(images: Images) -> Walls | None:
-        seen_from = lambda: walls_of(problem, cloud, images, part)  # the same for all orders
-        return seen_from() if part is not None else kept(cloud, ("walls", pairs), seen_from)
-
     def place() -> Placed:
         held = np.zeros((len(cloud), problem.fields), bool)
         n_own = np.zeros(len(cloud), int)
@@ -189,7 +185,8 @@ def _placed(
         held[partner != np.arange(len(cloud))] = True
         if len(images.owner) and scheme.method in ("I", "II"):
             raise ValueError(f"method: {scheme.method} does not follow periodic conditions; use S, III or SSPH")
-        walls, found = boundary(images), stencils
+        around = lambda: walls_of(problem, cloud, images, part)  # the same for all orders
+        walls, found = around() if part is not None else kept(cloud, ("walls", pairs), around), stencils
         if found is None:
             conditioned = np.flatnonzero((n_own > 0) & ~held.all(axis=1))
             found = find_stencils(cloud, kernel, scheme, images, conditioned, walls, part)

@@ -1,11 +1,10 @@
 """What a finished solve says against itself: cheap tests, and a sentence for each that fails.
 
-None of the tests costs a moment system: some solves with the kept factors and sums over neighbours.
-They clear what is linear, of one field and far from their bounds. Everywhere else the error estimate
-(``js.Solution.error_estimate``) is asked, which costs another assembly of a higher order, and decides: it clears
-what was only suspected, and is a flag itself where it is large. What no particle sees it does not see either, and
-is looked for by itself (``jsmitsm.solution.look``). A healthy solution has no flags. A flag is no proof of an
-error, nor its absence one of accuracy.
+None of the tests costs a moment system: some solves with the kept factors and sums over neighbours. They clear what is
+linear, of one field and far from their bounds. Everywhere else the error estimate (``js.Solution.error_estimate``) is
+asked, which costs another assembly of a higher order, and decides: it clears what was only suspected, and is a flag
+itself where it is large. What no particle sees it does not see either, and is looked for by itself
+(``jsmitsm.solution.look``). A healthy solution has none; one is no proof of an error, nor its absence of accuracy.
 """
 
 from __future__ import annotations
@@ -34,6 +33,7 @@ from jsmitsm.discretization.resolution.steepness import unseen as beyond_slopes
 from jsmitsm.discretization.rows import all_rows
 from jsmitsm.runtime.errors import some
 from jsmitsm.solution.look.between import beyond_kinks
+from jsmitsm.solution.look.reach import fits
 from jsmitsm.solution.look.sizes import predicted, scales, share
 from jsmitsm.solution.look.told import CLEARED, data, out_of_reach, unseen
 
@@ -120,7 +120,7 @@ def flags(run: Any, values: Any, nums: Any, estimated: Callable[[], float]) -> t
         found["estimate"] = estimated()
         least, most = _clearing(found, run.disc.rec.order)
         if not least <= found["estimate"] <= most:
-            return [*doubts, *out_of_reach(run, values, found), *data(run, values, found)], found
+            return [*doubts, *out_of_reach(run, values, found), *data(run, values, found, fits(run, values))], found
     # Near a resonance any residual grows without bound, that of the truncation too; the estimate has its signs.
     return [] if singular else unseen(run, values, found, cleared, found.get("source", 0.0) > SOURCE), found
 

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 import jsmitsm as js
+from jsmitsm.solution.look.between import unseen_data
+from jsmitsm.solution.look.reach import fits
 
 ENDS = {"left": js.dirichlet(0.0), "right": js.dirichlet(0.0)}
 SIDES = ("left", "right", "bottom", "top")
@@ -70,6 +72,20 @@ def test_boundary_data_that_particles_see(data):
     data = data[: len(cloud.groups["bottom"])] if isinstance(data, np.ndarray) else data
     bcs = {g: js.dirichlet(0.0) for g in SIDES} | {"bottom": js.dirichlet(data)}
     assert not flagged(lambda u, x: js.laplacian(u)(x) - 1.0, bcs, cloud, "boundary data")
+
+
+@pytest.mark.parametrize(
+    "data, part", [(lambda x: jnp.sin(8 * jnp.pi * x[0]), (0.0, 0.1)), (lambda x: bump(x[0], 0.52, 0.01), (0.9, 1.0))]
+)
+def test_polynomials_see_resolved_data_between_the_particles(data, part):
+    """Between waves of six particles the mean of both ends is off by an eighth, the polynomials are not; a bump between
+    two particles is news to both."""
+    cloud = js.rectangle((0.0, 0.0), (1.0, 1.0), (25, 25))
+    bcs = {g: js.dirichlet(0.0) for g in SIDES} | {"bottom": js.dirichlet(data)}
+    sol = js.solve(js.Problem(lambda u, x: js.laplacian(u)(x), bcs), cloud, order=6)
+    run, values = sol._report, np.asarray(sol.u)[:, None]
+    plain, asked = unseen_data(run).max(), unseen_data(run, fits(run, values)()).max()
+    assert plain > 1e-3 and part[0] * plain <= asked <= part[1] * plain
 
 
 @pytest.mark.parametrize(

@@ -165,9 +165,12 @@ def nearest_of(disc: Discretization, cls: Class, count: int) -> np.ndarray:
     return np.where(np.take_along_axis(there, first, axis=1), np.take_along_axis(near, first, axis=1), -1)
 
 
-def unseen_data(run: Any) -> np.ndarray:
-    """What boundary data do between the particles, unseen by them, makes of the solution of a run, (N, F)."""
-    unseen = data_between(run.disc, run.nums, run.problem)
+def unseen_data(run: Any, fitted: np.ndarray | None = None) -> np.ndarray:
+    """What boundary data do between the particles, unseen by them, makes of the solution of a run, (N, F).
+
+    fitted (N, F, K): the local polynomials, which see held values between the particles where they are resolved.
+    """
+    unseen = data_between(run.disc, run.nums, run.problem, fitted)
     if unseen is None:
         return np.zeros(run.disc.held.shape)
     made = _made_of(run, unseen)
@@ -176,11 +179,14 @@ def unseen_data(run: Any) -> np.ndarray:
     return np.where(given_in if given_in.any() else True, made, 0.0)
 
 
-def data_between(disc: Discretization, nums: Numbers, problem: Problem) -> Numbers | None:
+def data_between(
+    disc: Discretization, nums: Numbers, problem: Problem, fitted: np.ndarray | None = None
+) -> Numbers | None:
     """The numbers of the same operator with what its boundary data do between the particles alone; None: nothing.
 
     Data given by functions are looked at halfway to the nearest particles of the same group, and compared with the
-    mean of both. A function that says there what it says at the particle has nothing to tell, nor has an array.
+    mean of both, held values also with the polynomials if they are given. A function that says there what it says at
+    the particle has nothing to tell, nor has an array.
     """
     zero, ways, told = np.zeros_like, 2 * (disc.rec.dim - 1), whole(disc)
     if not ways or told.total(sum(not group.linear for group in disc.groups)):
@@ -191,13 +197,28 @@ def data_between(disc: Discretization, nums: Numbers, problem: Problem) -> Numbe
     own = np.flatnonzero(disc.n_own)
     for k in range(ways):
         moved, near = _halfway(disc, cloud, k)
-        there = conditions_at(disc, problem, moved)
-        for total, a, b, other in zip(found, here, there, (near, np.searchsorted(own, near[own]), near)):
-            total += np.where(a == b, 0.0, b - 0.5 * (a + a[other])) / ways
+        there = [np.asarray(x, float) for x in conditions_at(disc, problem, moved)]
+        others = near, np.searchsorted(own, near[own]), near
+        away = [np.where(a == b, 0.0, b - 0.5 * (a + a[other])) for a, b, other in zip(here, there, others)]
+        if fitted is not None:
+            missed = there[0] - _expanded(disc, fitted, np.asarray(moved.points))
+            away[0] = np.where(np.abs(missed) < np.abs(away[0]), missed, away[0])
+        for total, part in zip(found, away):
+            total += part / ways
     if not told.total(sum(int(x.any()) for x in found)):
         return None
     held, given, gamma = found
     return replace(nums, source=zero(nums.source), held=held, given=given, gamma=gamma)
+
+
+def _expanded(disc: Discretization, fitted: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """The polynomials (N, F, K) of the nearest particles that carry equations at points (M, D), (M, F)."""
+    from scipy.spatial import cKDTree
+
+    points = np.asarray(disc.points, float)[disc.active]
+    near = cKDTree(points).query(at)[1]
+    terms = monomials_on_host((at - points[near]).T, disc.rec.reach)[: fitted.shape[2]]
+    return np.einsum("nfk,kn->nf", fitted[disc.active][near], terms)
 
 
 def _halfway(disc: Discretization, cloud: Cloud, k: int) -> tuple[Cloud, np.ndarray]:

@@ -43,7 +43,7 @@ def unseen(
             f"Between the particles the equation is missed by as much as makes {missed:.0%} of the solution: the "
             "source or a coefficient changes within the spacing, unseen by the particles; refine there, or smooth it."
         )
-    told += data(run, values, found)
+    told += data(run, values, found, fitted)
     if beyond > CLEARED:
         told.append(
             f"The equation is not the same on both sides of a periodic pair, which makes {beyond:.0%} of the solution: "
@@ -52,10 +52,13 @@ def unseen(
     return told
 
 
-def data(run: Any, values: np.ndarray, found: dict[str, float]) -> list[str]:
-    """Of boundary data between the particles."""
+def data(run: Any, values: np.ndarray, found: dict[str, float], fitted: Fits | None = None) -> list[str]:
+    """Of boundary data between the particles; where these seem not to see them, the polynomials are asked."""
     every = whole(run.disc)
-    found["data"] = made = share(every.own(unseen_data(run)), every.own(values), told=every)
+    made = share(every.own(unseen_data(run)), every.own(values), told=every)
+    if made > DATA and fitted is not None:
+        made = share(every.own(unseen_data(run, fitted())), every.own(values), told=every)
+    found["data"] = made
     if made <= DATA:
         return []
     return [
