@@ -56,7 +56,8 @@ def test_asked_twice_a_cloud_with_a_slit_says_the_same():
     assert np.array_equal(narrow, np.asarray(nearest_seen(points, 20, None, walls(cloud)).indices))
     # Beyond a few spacings from the tip nobody sees across the slit.
     r = np.linalg.norm(points, axis=1)
-    side = np.where((points[:, 0] > 0.3) & (np.abs(points[:, 1]) < 0.15), np.sign(points[:, 1] + 0.005 * points[:, 0]), 0.0)
+    beside = (points[:, 0] > 0.3) & (np.abs(points[:, 1]) < 0.15)
+    side = np.where(beside, np.sign(points[:, 1] + 0.005 * points[:, 0]), 0.0)
     far = (r > 0.3) & (side != 0)
     across = (side[narrow] * side[:, None] < 0) & (narrow >= 0)
     assert far.sum() > 20 and not across[far].any()
