@@ -380,8 +380,7 @@ class Rounds:
         # Contributions at another order are others, in a constant at least: they tell no rate.
         comparable = len(self.rows) > 1 and self.rows[-1][1] == self.rows[-2][1] and np.isfinite(found.error)
         points, before = np.asarray(cloud.points), self.before if comparable else None
-        turned = edges(cloud, self.solution.neighbours)
-        return marks(points, spacing(points), found.contribution, self._power(cloud), before, turned)
+        return marks(points, spacing(points), found.contribution, self._power(cloud), before, edges(cloud))
 
     def _better(self, spacing: SpacingField) -> SpacingField | None:
         """The spacing of a round before that did better than the last one, over which no other may grow then."""

@@ -17,7 +17,6 @@ from jsmitsm.adaptation.marking import Marks, marks, next_spacing
 from jsmitsm.adaptation.measure import Measured
 from jsmitsm.adaptation.rounds import Rounds
 from jsmitsm.adaptation.spacing_field import GROWTH, SpacingField
-from jsmitsm.cloud.neighbours import nearest
 
 CORNER = [(0, 0), (1, 0), (1, 1), (-1, 1), (-1, -1), (0, -1)]
 SQUARE = [(0, 0), (1, 0), (1, 1), (0, 1)]
@@ -245,8 +244,7 @@ def test_a_singular_point_found_twice_is_refined_by_far():
 def test_a_singular_point_beside_an_edge_is_the_edge():
     """The worst particle is beside the corner, and so is the largest mean; smoothness ends where the boundary turns."""
     cloud = js.from_polygon(CORNER, 0.1)
-    seen = np.asarray(nearest(np.asarray(cloud.points), 12).indices)
-    points, edge = np.asarray(cloud.points), edges(cloud, seen)
+    points, edge = np.asarray(cloud.points), edges(cloud)
     assert len(cloud.boundary[edge[cloud.boundary]]) == 6
     assert np.linalg.norm(points[edge][:, None] - np.array(CORNER, float), axis=2).min(axis=1).max() < 1e-12
     beside = int(np.argmin(np.linalg.norm(points - [-0.05, 0.07], axis=1)))
@@ -255,6 +253,17 @@ def test_a_singular_point_beside_an_edge_is_the_edge():
     found = marks(points, np.full(len(points), 0.07), 0.9 * eta, 5.0, first, edge)
     assert found.singular.sum() == 1 and np.linalg.norm(points[found.singular][0]) < 1e-12
     assert marks(points, np.full(len(points), 0.07), 0.9 * eta, 5.0, first).singular[beside]
+
+
+@pytest.mark.parametrize("spacing", [0.15, 0.06, lambda x: np.clip(0.25 * np.linalg.norm(x, axis=1), 1e-5, 0.1)])
+@pytest.mark.parametrize("notch", [[(1, -1), (1, -0.01)], [(1, -1), (1, -0.4)], [(-0.01, -1)]])
+def test_edges_are_the_vertices_of_slits_and_wedges_too(notch, spacing):
+    polygon = np.array([(0, 0), (1, 0), (1, 1), (-1, 1), (-1, -1), *notch], float)
+    cloud = js.from_polygon(polygon, spacing)
+    at = np.asarray(cloud.points)[edges(cloud)]
+    apart = np.linalg.norm(at[:, None] - polygon, axis=2)
+    assert apart.min(axis=0).max() < 1e-12
+    assert np.linalg.norm(at[apart.min(axis=1) > 1e-12], axis=1).min(initial=1.0) > 0.5  # at the mouth, if any
 
 
 def test_where_a_side_stops_being_held_the_values_are_in_doubt():
