@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from jsmitsm.cloud.walls import Walls, nearest_seen
+from jsmitsm.cloud.sight.walls import Walls, nearest_seen
 from jsmitsm.discretization.coefficients import Numbers
 from jsmitsm.discretization.layout import Class, Discretization, rounded_width
 from jsmitsm.discretization.local_data import shared_elimination

@@ -12,7 +12,7 @@ import numpy as np
 from jsmitsm.cloud.cloud import Cloud, kept
 from jsmitsm.cloud.neighbours import Stencils
 from jsmitsm.cloud.regions.region_cloud import RegionCloud
-from jsmitsm.cloud.walls import Walls, seen
+from jsmitsm.cloud.sight.walls import Walls, seen
 from jsmitsm.discretization.parts.whole import Part
 from jsmitsm.discretization.periodic import Images, periodic_images, with_corners
 from jsmitsm.discretization.resolution.digits import room, suited_depth, warn_of_float32

@@ -9,7 +9,7 @@ import numpy as np
 
 from jsmitsm.cloud.cloud import INTERIOR, Cloud
 from jsmitsm.cloud.neighbours import Stencils, evenly_spaced, in_line, jumps, replaced, within
-from jsmitsm.cloud.walls import Walls, nearest_seen, within_seen
+from jsmitsm.cloud.sight.walls import Walls, nearest_seen, within_seen
 from jsmitsm.discretization.parts.whole import Part
 from jsmitsm.discretization.periodic import Images
 from jsmitsm.equation.problem import Problem
@@ -70,7 +70,7 @@ def find_stencils(
     cloud: Cloud, kernel: Kernel | None, scheme: Scheme, images: Images, conditioned: np.ndarray, walls: Walls | None,
     part: Part | None = None,
 ) -> Stencils:  # fmt: skip
-    """Neighbours that each particle sees, see ``jsmitsm.cloud.walls``; outward normals are checked by the way."""
+    """Neighbours that each particle sees, see ``jsmitsm.cloud.sight.walls``; outward normals are checked by the way."""
     found = _found_stencils(cloud, kernel, scheme, images, conditioned, walls, part)
     if walls is not None and cloud.dim == 1:
         walls.check_outward(np.asarray(found.indices))

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jsmitsm.cloud.walls import nearest_seen, within_seen
+from jsmitsm.cloud.sight.walls import nearest_seen, within_seen
 from jsmitsm.discretization.coefficients import Numbers
 from jsmitsm.discretization.layout import Class, Discretization
 from jsmitsm.discretization.local_data import around, operands, right_sides, sent

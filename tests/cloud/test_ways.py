@@ -4,9 +4,9 @@ import numpy as np
 from scipy.sparse import coo_array
 
 import jsmitsm as js
-from jsmitsm.cloud import ways
-from jsmitsm.cloud.walls import nearest_seen
-from jsmitsm.cloud.ways import Looked, Ways
+from jsmitsm.cloud.sight import ways
+from jsmitsm.cloud.sight.walls import nearest_seen
+from jsmitsm.cloud.sight.ways import Looked, Ways
 from jsmitsm.discretization.periodic import periodic_images
 from jsmitsm.discretization.supports import walls_of
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from jsmitsm.cloud.neighbours import in_line
-from jsmitsm.cloud.walls import nearest_seen
+from jsmitsm.cloud.sight.walls import nearest_seen
 from jsmitsm.discretization.coefficients import Numbers
 from jsmitsm.discretization.layout import Class, Discretization, rounded_width
 from jsmitsm.discretization.local_data import around, own_conditions

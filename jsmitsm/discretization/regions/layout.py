@@ -10,7 +10,7 @@ import numpy as np
 
 from jsmitsm.cloud.neighbours import Stencils
 from jsmitsm.cloud.regions.region_cloud import RegionCloud, sides
-from jsmitsm.cloud.walls import nearest_seen
+from jsmitsm.cloud.sight.walls import nearest_seen
 from jsmitsm.discretization.layout import Discretization, discretize, sorted_classes
 from jsmitsm.discretization.periodic import Images
 from jsmitsm.discretization.supports import default_size

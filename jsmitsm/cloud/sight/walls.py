@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from jsmitsm.cloud.neighbours import Stencils, nearest, within
-from jsmitsm.cloud.ways import Looked, Ways
+from jsmitsm.cloud.sight.ways import Looked, Ways
 
 # A particle is in front of another at a smaller angle (its cosine) to the normal than this.
 _FACING, _CUT = 0.5, 0.3

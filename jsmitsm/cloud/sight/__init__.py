@@ -1,0 +1,1 @@
+"""Which neighbours a particle sees."""
