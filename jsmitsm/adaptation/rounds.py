@@ -34,6 +34,9 @@ _LADDER = {
 _HOPE = 0.5
 # Polynomials of neighbours may differ between them by so many tolerances: they are off by so much more than the values.
 _GAP = 10.0
+# Where the values may be off by more than they are thought to be, they are off by so many times as much, no more: a
+# corner of hardly more than 180 degrees, at which no estimate sees anything, against a layer at a wall.
+_PARTLY = 2.5
 # Where smoothness ends solutions of two orders miss the same, and are nearer to each other than to what is true: the
 # distance is taken for this part of the error.
 _ALIKE = 0.5
@@ -265,8 +268,9 @@ class Rounds:
             between = apart / found.scale / _GAP
             if between.max() > self.tol:
                 self.apart = apart
-            else:  # where smoothness ends the values are off by as much
-                self.error = max(self.error, float(between[rate < SLOW].max(initial=0.0)))
+            else:  # where smoothness ends the values are off by as much, elsewhere by some of it
+                some = min(_PARTLY * self.error, float(between.max()))
+                self.error = max(self.error, float(between[rate < SLOW].max(initial=some)))
         self.undoubted = max(self.error, self._disagreed())
         self.error = max(self.undoubted, self._doubted(found, rate))
         self.reached = self.error <= self.tol and not self.flags and self.apart is None

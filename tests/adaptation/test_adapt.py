@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import jsmitsm as js
+from benchmarks.adaptation import CASES, true_error
 from jsmitsm.adaptation.data import data_of, unresolved
 from jsmitsm.adaptation.edges import edges
 from jsmitsm.adaptation.first_cloud import first_cloud
@@ -264,6 +265,13 @@ def test_edges_are_the_vertices_of_slits_and_wedges_too(notch, spacing):
     apart = np.linalg.norm(at[:, None] - polygon, axis=2)
     assert apart.min(axis=0).max() < 1e-12
     assert np.linalg.norm(at[apart.min(axis=1) > 1e-12], axis=1).min(initial=1.0) > 0.5  # at the mouth, if any
+
+
+def test_a_corner_that_nobody_sees_is_in_the_error():
+    """Of 180.6 degrees: solutions of two orders are off by the same there, five times what parts them."""
+    case = CASES["corner-180"]()
+    found = js.adapt(case.problem, case.make, 1e-3, progress=False)
+    assert found.reached and 1 / 3 < found.error / true_error(case, found) < 5
 
 
 def test_where_a_side_stops_being_held_the_values_are_in_doubt():
