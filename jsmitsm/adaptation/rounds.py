@@ -36,7 +36,7 @@ _HOPE = 0.5
 _GAP = 10.0
 # Where the values may be off by more than they are thought to be, they are off by so many times as much, no more: a
 # corner of hardly more than 180 degrees, at which no estimate sees anything, against a layer at a wall.
-_PARTLY = 2.5
+_PARTLY = 2.0
 # Where smoothness ends solutions of two orders miss the same, and are nearer to each other than to what is true: the
 # distance is taken for this part of the error.
 _ALIKE = 0.5
