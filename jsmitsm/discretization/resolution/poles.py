@@ -189,16 +189,18 @@ def _approached(
         size = np.where(infinite, np.inf, np.abs(value))
         return size.reshape(x.shape[:-1]), np.where(infinite, 0.0, way).T.reshape(x.shape)
 
-    at = points
+    at, moving = points.copy(), np.arange(len(points))
     size, way = looked(at)
     first = np.linalg.norm(way, axis=1)
     for _ in range(STEPS):
-        tried = at + PARTS[:, None, None] * np.where(np.isfinite(way), way, 0.0)
+        tried = at[moving] + PARTS[:, None, None] * np.where(np.isfinite(way[moving]), way[moving], 0.0)
         sizes, ways = looked(tried)
-        best = sizes.argmax(axis=0), np.arange(len(at))
-        better = sizes[best] > size
-        size = np.where(better, sizes[best], size)
-        at, way = (np.where(better[:, None], new[best], old) for new, old in ((tried, at), (ways, way)))
+        best = sizes.argmax(axis=0), np.arange(len(moving))
+        better = sizes[best] > size[moving]
+        best, moving = (best[0][better], best[1][better]), moving[better]  # who gets no nearer never will
+        if not len(moving):
+            break
+        size[moving], at[moving], way[moving] = sizes[best], tried[best], ways[best]
     left = np.linalg.norm(way, axis=1)
     shorter = (left < FOUND * reach) & (left < SHORTER * first)
     return at, shorter & (np.linalg.norm(at - points, axis=1) < reach)
