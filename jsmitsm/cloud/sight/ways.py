@@ -11,8 +11,8 @@ import numpy as np
 _DETOUR, _SLACK = 2.0, 0.5
 # Sources of one search for shortest ways.
 _CHUNK = 64
-# Particles whose spacings are within this ratio search together. Much finer ones than all of them and their neighbours
-# are no stations of their ways: around the tip of a crack there are thousands.
+# Particles whose neighbours' spacings are within this ratio search together. Much finer ones than all of these are no
+# stations of their ways: around the tip of a crack there are thousands.
 _BAND, _FINE = 4.0, 8.0
 # Of more answers than this those before are forgotten.
 _KEPT = 20_000_000
@@ -45,12 +45,14 @@ class Ways:
         return out
 
     def _bands(self, there: np.ndarray, rows: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """Rows (places) that search together, and the stations of their ways, by their numbers in the graph."""
-        finest = self.spacing[self.number[there]].min(axis=1)
-        band = np.floor(np.log(finest / finest.min()) / np.log(_BAND)).astype(int)
+        """Rows (places) that search together, and the stations of their ways, by their numbers in the graph.
+
+        Which these are hangs on a row alone, not on who else asks: processes ask for their own.
+        """
+        finest = np.maximum(self.spacing[self.number[there]].min(axis=1), 1e-300)
+        band = np.floor(np.log(finest) / np.log(_BAND))
         for b in np.unique(band):
-            some = np.flatnonzero(band == b)
-            yield some, np.flatnonzero(self.spacing >= finest[some].min() / _FINE)
+            yield np.flatnonzero(band == b), np.flatnonzero(self.spacing >= _BAND**b / _FINE)
 
 
 def _longer(graph: Any, at: np.ndarray, to: np.ndarray, allowed: np.ndarray) -> np.ndarray:
