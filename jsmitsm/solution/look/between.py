@@ -198,8 +198,8 @@ def data_between(
     for k in range(ways):
         moved, near = _halfway(disc, cloud, k)
         there = [np.asarray(x, float) for x in conditions_at(disc, problem, moved)]
-        others = near, np.searchsorted(own, near[own]), near
-        away = [np.where(a == b, 0.0, b - 0.5 * (a + a[other])) for a, b, other in zip(here, there, others)]
+        ends = near, np.searchsorted(own, near[own]), near
+        away = [np.where(a == b, 0.0, b - 0.5 * (a + a[other])) for a, b, other in zip(here, there, ends)]
         if fitted is not None:
             missed = there[0] - _expanded(disc, fitted, np.asarray(moved.points))
             away[0] = np.where(np.abs(missed) < np.abs(away[0]), missed, away[0])

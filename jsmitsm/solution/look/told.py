@@ -52,11 +52,11 @@ def unseen(
     return told
 
 
-def data(run: Any, values: np.ndarray, found: dict[str, float], fitted: Fits | None = None) -> list[str]:
+def data(run: Any, values: np.ndarray, found: dict[str, float], fitted: Fits) -> list[str]:
     """Of boundary data between the particles; where these seem not to see them, the polynomials are asked."""
     every = whole(run.disc)
     made = share(every.own(unseen_data(run)), every.own(values), told=every)
-    if made > DATA and fitted is not None:
+    if made > DATA:
         made = share(every.own(unseen_data(run, fitted())), every.own(values), told=every)
     found["data"] = made
     if made <= DATA:
