@@ -17,7 +17,7 @@ INTERIOR = "interior"
 # Coordinates beyond this, or all below its inverse, have powers that are no numbers.
 FAR = 1e100
 # What follows from the particles is kept with a cloud of up to so many, for so many different questions.
-_LARGEST_KEPT, _MOST_KEPT = 100_000, 8
+_LARGEST_KEPT, _MOST_KEPT = 100_000, 12
 
 
 class Groups(Mapping[str, np.ndarray]):

@@ -6,10 +6,11 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jsmitsm.cloud.cloud import Cloud
+from jsmitsm.cloud.cloud import Cloud, kept
 from jsmitsm.discretization.degenerate import Degenerate, settled
 from jsmitsm.discretization.layout import Discretization, crowded
 from jsmitsm.discretization.periodic import with_corners
@@ -17,12 +18,17 @@ from jsmitsm.discretization.resolution.kinks import softened
 from jsmitsm.discretization.resolution.poles import Poles, without_poles
 from jsmitsm.equation.conditions import group_conditions, merged
 from jsmitsm.equation.problem import Problem
+from jsmitsm.equation.traced import Traced
 from jsmitsm.particle.recursion import Recursion, source_rows
+from jsmitsm.runtime.compiled import Same
 from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.runtime.whole_program import in_one_program, picked
-from jsmitsm.taylor.multi_indices import Slot, factorial, index_of, multi_indices
+from jsmitsm.taylor.multi_indices import Slot, count, factorial, index_of, multi_indices
 from jsmitsm.taylor.series import Ring, mul
 
+# Series of no more numbers are kept with a cloud.
+_LARGEST_SERIES = 8_000_000
+_EXPECTED = "estimate"
 # Coefficients and sources up to this have squares that are numbers.
 LARGEST = 1e150
 _SINGLE = (
@@ -68,7 +74,7 @@ def numbers(disc: Discretization, problem: Problem, taylor: Any = None, everywhe
     everywhere = everywhere or disc.scheme.method in ("I", "II")  # neighbours recover derivatives too
     ids = np.arange(len(disc.cloud)) if everywhere else disc.active
     here = None if taylor is None else picked(taylor, ids)
-    jac, source = operator_numbers(disc, problem, picked(disc.cloud.points, ids), here)
+    jac, source = operator_numbers(disc, problem, ids, here)
     poles = None
     if disc.linear:
         jac, source, poles = without_poles(disc, problem, ids, jac, source)
@@ -128,11 +134,63 @@ def _at(disc: Discretization, held: list[dict[int, Any]]) -> Any:
     return _filled(np.zeros(disc.held.shape), places)
 
 
-def operator_numbers(disc: Discretization, problem: Problem, points: Any, taylor: Any) -> tuple[Any, Any]:
-    """Taylor coefficients of the (linearised) operator and the right-hand side of the recursion."""
-    rec, traced = disc.rec, disc.traced
+class _Series:
+    """Taylor coefficients of a linear operator and its residual at the particles of a cloud, as far as was asked."""
+
+    def __init__(self, traced: Traced, points: np.ndarray, params: Any):
+        self.traced, self.points, self.params = traced, points, params
+        self.degree, self.known = -1, np.zeros(len(points), bool)
+        self.jac: Any = None
+        self.residual: Any = None
+
+    def at(self, ids: np.ndarray, degree: int, ahead: int) -> tuple[Any, Any]:
+        """Those at particles, see ``Traced.coefficients``; ahead: degrees more that will be asked for soon."""
+        if degree > self.degree:
+            self.degree, self.jac, self.residual = degree + ahead, None, None
+            self.known[:] = False
+        new = ids[~self.known[ids]]
+        if len(new):
+            jac, residual = self.traced.coefficients(self.points[new], self.degree, params=self.params)
+            self.jac, self.residual = self._with(self.jac, jac, new), self._with(self.residual, residual, new)
+            self.known[new] = True
+        return self._part(self.jac, ids, degree), self._part(self.residual, ids, degree)
+
+    def _with(self, every: Any, some: Any, ids: np.ndarray) -> Any:
+        """The coefficients of all particles (..., T, N) with those of some (..., T, m)."""
+        if some is None or some.shape[-2:] == (1, 1):  # the same everywhere
+            return some
+        every = np.zeros((*some.shape[:-1], len(self.points)), some.dtype) if every is None else every
+        every[..., ids] = some
+        return every
+
+    def _part(self, every: Any, ids: np.ndarray, degree: int) -> Any:
+        if every is None or every.shape[-2:] == (1, 1):
+            return every
+        return every[..., : count(self.traced.dim, degree), :][..., ids]
+
+
+def expect_estimate(cloud: Cloud) -> None:
+    """An estimate will follow the next solve on a cloud: its series are two degrees longer, and hold all others."""
+    kept(cloud, _EXPECTED, lambda: True)
+
+
+def _series(disc: Discretization, problem: Problem, ids: np.ndarray) -> tuple[Any, Any]:
+    """Taylor coefficients of a linear operator and its residual at particles, kept with the cloud for other orders."""
+    traced, cloud, degree = disc.traced, disc.cloud, disc.rec.degree
+    size = len(cloud) * count(cloud.dim, degree) * int(traced.pattern.sum())
+    if size > _LARGEST_SERIES or is_traced(cloud.points, jax.tree.leaves((traced, problem.params))):
+        return traced.coefficients(picked(cloud.points, ids), degree, params=problem.params)
+    made = lambda: _Series(traced, np.asarray(cloud.points), problem.params)  # noqa: E731
+    numbers = tuple(np.asarray(x).tobytes() for x in jax.tree.leaves(problem.params))
+    ahead = 2 if kept(cloud, _EXPECTED, lambda: None) else 0
+    return kept(cloud, ("series", Same(traced), numbers), made).at(ids, degree, ahead)
+
+
+def operator_numbers(disc: Discretization, problem: Problem, ids: np.ndarray, taylor: Any) -> tuple[Any, Any]:
+    """Taylor coefficients of the (linearised) operator and the right-hand side of the recursion at particles."""
+    rec, traced, points = disc.rec, disc.traced, picked(disc.cloud.points, ids)
     if traced.linear:
-        jac, res = traced.coefficients(points, rec.degree, params=problem.params)
+        jac, res = _series(disc, problem, ids)
         if res is None:
             _refuse_nonfinite(points, jac)
             return jac, np.zeros((rec.n_rows, 1))

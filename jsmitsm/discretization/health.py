@@ -159,8 +159,6 @@ def _repaired(
         left = np.flatnonzero(best.lebesgue > LEBESGUE)
         if not len(left):
             break
-        # One shape for all attempts: compiling costs far more than computing a few rows twice.
-        left = np.resize(left, len(ids))
         question = number, size, ids[left].tobytes()
         if question not in kept:
             if len(kept) >= _KEPT:

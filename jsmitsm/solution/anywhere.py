@@ -49,11 +49,15 @@ class Anywhere(Copied):
         """Taylor coefficients (N, F, K)."""
         self.refuse_stacked()
         if self._fitted is None:
-            fitted = self._fit.coefficients(self._values)
+            fitted = self._expanded()
             if is_traced(fitted):
                 return fitted
             self._fitted = frozen(fitted)
         return self._fitted
+
+    def _expanded(self) -> Any:
+        """Taylor coefficients (N, F, K), fitted to the values."""
+        return self._fit.coefficients(self._values)
 
     @explaining
     def __call__(self, points: ArrayLike, *, blend: bool = False, outside: str = "nan") -> jax.Array:

@@ -134,7 +134,8 @@ def correction(fit: Fit, values: Any, made: Run | None = None) -> Correction:
         return spread(run.factor_of(*matrix(low, *own())).solve(right, transpose=transpose)[: len(free)])
 
     def between() -> Any:
-        fitted = lambda: np.asarray(all_coefficients(low, nums(), values), float)
+        of = made.fitted if made is not None and made.nums is not None else partial(all_coefficients, low)
+        fitted = lambda: np.asarray(of(nums(), values), float)
         defect = unseen(low, nums(), fit.problem, own(), fitted)
         if defect is None:
             return None

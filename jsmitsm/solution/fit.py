@@ -54,13 +54,17 @@ class Fit:
         return discretize(self.problem, self.cloud, r.method, r.order, self.kernel, near, r.basis_terms, depth=r.depth)
 
     @bar("fitting")
-    def coefficients(self, values: Any, about: Any = None) -> Any:
+    def coefficients(self, values: Any, about: Any = None, known: Any = None) -> Any:
         """Taylor coefficients (N, F, K) of every particle.
 
         about: other values (N, F) whose polynomials are what held particles of a nonlinear problem are linearised at.
+        known: those of the particles that carry equations, where they are at hand.
         """
         disc, taylor = self.discretization(), self.taylor
         held = held_particles(disc)
+        if known is not None:
+            found = self._fitted(disc, held, taylor, values) if len(held) else known
+            return np.where(np.isin(disc.partner, held)[:, None, None], found, known)
         if taylor is not None and len(held):
             # Those of held particles are continued from others; fitted where that is linearised they are their own.
             fitted = self._fitted(disc, held, taylor, values if about is None else about)

@@ -33,7 +33,6 @@ from jsmitsm.discretization.resolution.steepness import unseen as beyond_slopes
 from jsmitsm.discretization.rows import all_rows
 from jsmitsm.runtime.errors import some
 from jsmitsm.solution.look.between import beyond_kinks
-from jsmitsm.solution.look.reach import fits
 from jsmitsm.solution.look.sizes import predicted, scales, share
 from jsmitsm.solution.look.told import CLEARED, data, out_of_reach, unseen
 
@@ -120,7 +119,7 @@ def flags(run: Any, values: Any, nums: Any, estimated: Callable[[], float]) -> t
         found["estimate"] = estimated()
         least, most = _clearing(found, run.disc.rec.order)
         if not least <= found["estimate"] <= most:
-            return [*doubts, *out_of_reach(run, values, found), *data(run, values, found, fits(run, values))], found
+            return [*doubts, *out_of_reach(run, values, found), *data(run, values, found)], found
     # Near a resonance any residual grows without bound, that of the truncation too; the estimate has its signs.
     return [] if singular else unseen(run, values, found, cleared, found.get("source", 0.0) > SOURCE), found
 

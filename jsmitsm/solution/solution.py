@@ -16,7 +16,7 @@ from jsmitsm.runtime.errors import SolveError, explained, explaining
 from jsmitsm.runtime.tracers import frozen, is_traced, owned
 from jsmitsm.solution.anywhere import Anywhere
 from jsmitsm.solution.estimate import Correction, correction
-from jsmitsm.solution.fit import Recipe
+from jsmitsm.solution.fit import Fit, Recipe
 from jsmitsm.solution.flags import SQUARED, too_large
 from jsmitsm.solution.look.reach import beyond_orders
 from jsmitsm.solution.look.sizes import NOTHING, share
@@ -120,6 +120,12 @@ class Solution(Anywhere):
         """Taylor coefficients d^a u / a!, (N, K), ordered as ``js.multi_indices``; (N, K, F) for a system."""
         fitted = self._taylor
         return fitted[:, 0] if self._recipe.fields == 1 else jnp.swapaxes(fitted, 1, 2)
+
+    def _expanded(self) -> Any:
+        run = self._report
+        if not isinstance(self._fit, Fit) or not isinstance(run, Run) or not run.disc.linear or run.nums is None:
+            return super()._expanded()
+        return self._fit.coefficients(self._values, known=run.fitted(run.nums, np.asarray(self._values, float)))
 
     @explaining
     def error_estimate(self) -> Array:

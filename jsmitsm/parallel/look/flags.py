@@ -48,6 +48,7 @@ class Look:
         self.rows = all_rows(self.disc, self.nums)
         self.factor = Factor(system)
         self._fitted: np.ndarray | None = None
+        self.misses: Any = None
 
     def fitted(self, nums: Any, values: Any) -> np.ndarray:
         """The polynomials (n, F, K) of the values at all particles that carry equations, each its owner's."""

@@ -23,6 +23,7 @@ from jsmitsm.discretization.resolution.residuals import evaluated, residual
 from jsmitsm.discretization.rows import all_coefficients, all_rows
 from jsmitsm.equation.problem import Problem
 from jsmitsm.particle.polynomials import monomials_on_host
+from jsmitsm.solution.look.halfway import WAYS, around, looked_at, pairs
 from jsmitsm.taylor.multi_indices import multi_indices
 
 # A particle of the same group so many times as far as the nearest ones of all, or whose normal has less than this part
@@ -31,22 +32,17 @@ NEAR, ASIDE = 1.5, 0.5
 # A coefficient or a source halfway is even where it differs from the mean of both ends by less than this part of them,
 # or of so small a part of the largest anywhere: ten particles a wavelength leave 0.05.
 UNEVEN, SMALL = 0.2, 0.01
-# On the way to a neighbour one looks at these parts of it, by dimension; from both ends they are nearly twice as many.
-WAYS = {1: (0.5, 0.11, 0.21, 0.31, 0.41), 2: (0.5, 0.25), 3: (0.5,)}
 # A series ends at a kink where it misses what is halfway to a neighbour by so many times its last two degrees there,
 # and by more than this part of what is there.
 ENDED, FAINT = 3.0, 1e-6
 
 
-def between(run: Any, fitted: Callable[[], np.ndarray]) -> np.ndarray:
-    """What the residual between the particles makes of the solution of a run, (N, F).
-
-    fitted: makes the local polynomials (N, F, K), here and below.
-    """
+def between(run: Any, values: np.ndarray) -> np.ndarray:
+    """What the residual between the particles makes of the solution of a run, (N, F)."""
     disc = run.disc
     if same_everywhere(disc):
         return np.zeros(disc.held.shape)
-    return _made_of(run, unresolved(disc, run.nums, run.problem, fitted()))
+    return _made_of(run, unresolved(disc, run.nums, run.problem, run.fitted(run.nums, values)))
 
 
 def same_everywhere(disc: Discretization) -> bool:
@@ -79,12 +75,10 @@ def out_of_series(disc: Discretization, nums: Numbers, problem: Problem, fitted:
 
     fitted (N, F, K): the local polynomials.
     """
-    points, place = np.asarray(disc.points, float), _places(disc, nums)
-    missed = np.zeros((disc.rec.n_rows, len(nums.ids)))
-    for cls in disc.classes:
-        at = place[cls.ids]
-        left = lambda there, offset, u=fitted[cls.ids], at=at: _left_out(disc, nums, problem, there, offset, u, at)
-        missed[np.array(disc.rec.equation_rows)[:, None], at] = _around(disc, cls, points, left)
+    place, missed = _places(disc, nums), np.zeros((disc.rec.n_rows, len(nums.ids)))
+    left = lambda ids, there, offset: _left_out(disc, nums, problem, there, offset, fitted[ids], place[ids])
+    ids, mean = around(disc, disc.classes, left)
+    missed[np.array(disc.rec.equation_rows)[:, None], place[ids]] = mean
     for _, particle, e, slot, rest in zip(*(nums.poles or ())):
         size = 1.0 if slot < 0 else abs(fitted[particle, disc.rec.slots[slot][0], 0])
         row, at = disc.rec.equation_rows[e], place[particle]
@@ -135,34 +129,18 @@ def even(run: Any) -> bool:
 
     known = at(points)
     largest = told.most(np.abs(known).max(axis=2, keepdims=True))
-    uneven = False
-    for cls in disc.classes:
-        near = _looked_at(disc, cls)
-        for other in near.T:
-            ids, to = cls.ids[other >= 0], other[other >= 0]
-            if uneven or not len(ids):
-                continue
-            ends = known[:, :, ids], known[:, :, to]
-            size = np.maximum(np.maximum(*map(np.abs, ends)), SMALL * largest)
-            for part in WAYS[disc.rec.dim]:
-                away = at((1.0 - part) * points[ids] + part * points[to]) - (1.0 - part) * ends[0] - part * ends[1]
-                uneven |= bool((np.abs(away) > UNEVEN * size).any())
-    return not told.most(float(uneven))
 
+    def uneven(here: np.ndarray, to: np.ndarray) -> bool:
+        ends = known[:, :, here], known[:, :, to]
+        size = np.maximum(np.maximum(*map(np.abs, ends)), SMALL * largest)
+        for part in WAYS[disc.rec.dim]:
+            away = at((1.0 - part) * points[here] + part * points[to]) - (1.0 - part) * ends[0] - part * ends[1]
+            if (np.abs(away) > UNEVEN * size).any():
+                return True
+        return False
 
-def _looked_at(disc: Discretization, cls: Class) -> np.ndarray:
-    """The neighbours (n, k) on the way to which one looks: on a lattice those along its axes and across its cells."""
-    dim = disc.rec.dim
-    return nearest_of(disc, cls, 2 * dim + (2**dim if dim > 1 else 0))
-
-
-def nearest_of(disc: Discretization, cls: Class, count: int) -> np.ndarray:
-    """The nearest neighbours (n, k) of the particles of a class, -1 where there are fewer; stencils need no order."""
-    near, points = np.asarray(cls.neighbours), np.asarray(disc.points, float)
-    there = (near >= 0) & (near != cls.ids[:, None])
-    square = np.square(points[np.where(there, near, 0)] - points[cls.ids][:, None]).sum(axis=2)
-    first = np.argsort(np.where(there, square, np.inf), axis=1, kind="stable")[:, :count]
-    return np.where(np.take_along_axis(there, first, axis=1), np.take_along_axis(near, first, axis=1), -1)
+    ids, near = looked_at(disc, disc.classes)
+    return not told.most(float(any(uneven(ids[row], near[row, column]) for row, column in pairs(near, 2))))
 
 
 def unseen_data(run: Any, fitted: np.ndarray | None = None) -> np.ndarray:
@@ -313,10 +291,10 @@ def unresolved(disc: Discretization, nums: Numbers, problem: Problem, fitted: np
     source or a coefficient that the particles do not see, or whose Taylor series ends before it reaches the neighbours,
     shows there.
     """
-    points, place = np.asarray(disc.points, float), _places(disc, nums)
     source = np.zeros((disc.rec.n_rows, len(nums.ids)))
-    for cls in disc.classes:
-        source[np.array(disc.rec.equation_rows)[:, None], place[cls.ids]] = _mean(disc, problem, cls, points, fitted)
+    left = lambda ids, there, offset: residual(disc, problem, there, offset, fitted[ids])
+    ids, mean = around(disc, disc.classes, left, WAYS[disc.rec.dim])
+    source[np.array(disc.rec.equation_rows)[:, None], _places(disc, nums)[ids]] = mean
     return with_source(nums, source)
 
 
@@ -356,43 +334,17 @@ def unseen(
 
 def _source_left_out(disc: Discretization, nums: Numbers, problem: Problem, rows: Any) -> np.ndarray:
     """By how much the source of a linear equation halfway to the neighbours differs from its series, as a source."""
-    points, place = np.asarray(disc.points, float), _places(disc, nums)
-    known, missed = np.asarray(nums.source), np.zeros((disc.rec.n_rows, len(nums.ids)))
+    place, known = _places(disc, nums), np.asarray(nums.source)
+    missed = np.zeros((disc.rec.n_rows, len(nums.ids)))
     series = [[k for k, (e, _) in enumerate(disc.rec.row_index) if e == f] for f in range(len(disc.rec.orders))]
-    for cls in rows[0]:
-        at = place[cls.ids]
 
-        def left(there: np.ndarray, offset: np.ndarray, at: np.ndarray = at) -> np.ndarray:
-            away = -np.asarray(disc.traced.residuals(there, params=problem.params))
-            powers = monomials_on_host(offset.T, disc.rec.degree)
-            for e, some in enumerate(series):
-                away[e] -= np.einsum("kn,kn->n", known[some][:, at], powers[: len(some)])
-            return np.where(np.isfinite(away), away, 0.0)  # infinite on the boundary
+    def left(ids: np.ndarray, there: np.ndarray, offset: np.ndarray) -> np.ndarray:
+        away = -np.asarray(disc.traced.residuals(there, params=problem.params))
+        powers = monomials_on_host(offset.T, disc.rec.degree)
+        for e, some in enumerate(series):
+            away[e] -= np.einsum("kn,kn->n", known[some][:, place[ids]], powers[: len(some)])
+        return np.where(np.isfinite(away), away, 0.0)  # infinite on the boundary
 
-        missed[np.array(disc.rec.equation_rows)[:, None], at] = _around(disc, cls, points, left)
+    ids, mean = around(disc, rows[0], left)
+    missed[np.array(disc.rec.equation_rows)[:, None], place[ids]] = mean
     return missed
-
-
-def _mean(disc: Discretization, problem: Problem, cls: Class, points: np.ndarray, fitted: np.ndarray) -> np.ndarray:
-    """The mean residual (E, n) around every particle of a class, whose own share of it is zero."""
-    left = lambda at, offset: residual(disc, problem, at, offset, fitted[cls.ids])
-    return _around(disc, cls, points, left, WAYS[disc.rec.dim])
-
-
-def _around(
-    disc: Discretization, cls: Class, points: np.ndarray, left: Callable[..., Any], ways: tuple[float, ...] = (0.5,)
-) -> np.ndarray:  # fmt: skip
-    """The mean (E, n) of something that vanishes at the particles of a class and is left(points, offsets) halfway.
-
-    ways: the parts of the way to a neighbour at which one looks, and takes what is largest.
-    """
-    near = _looked_at(disc, cls)
-    total, count = np.zeros((len(disc.rec.orders), len(cls.ids))), np.ones(len(cls.ids))
-    for k in range(near.shape[1]):
-        there = near[:, k] >= 0
-        way = points[np.where(there, near[:, k], cls.ids)] - points[cls.ids]
-        found = np.stack([left(points[cls.ids] + part * way, part * way) for part in ways])
-        found = np.take_along_axis(found, np.abs(found).argmax(axis=0)[None], axis=0)[0]
-        total += np.where(there, found, 0.0)
-        count += there
-    return total / count

@@ -7,8 +7,6 @@ two orders' solutions tells nothing there. What each leaves of its neighbours' v
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import cache
 from typing import Any
 
 import numpy as np
@@ -17,9 +15,9 @@ from jsmitsm.discretization.layout import Class, Discretization
 from jsmitsm.discretization.parts.whole import whole
 from jsmitsm.particle.moments import Row
 from jsmitsm.particle.polynomials import monomials_on_host
-from jsmitsm.solution.look.between import beyond_kinks, nearest_of, solved_alone
+from jsmitsm.solution.look.between import beyond_kinks, solved_alone
+from jsmitsm.solution.look.halfway import nearest_of
 
-Fits = Callable[[], np.ndarray]
 # A polynomial does not reach its nearest neighbours where it misses one by this part of the largest change to any of
 # them: 0.1 to 0.5 beside square roots and jumps of data. By order: up to 3, and above.
 LOST = (0.1, 0.06)
@@ -40,26 +38,21 @@ def beyond_orders(run: Any, values: np.ndarray, known: np.ndarray) -> np.ndarray
 
     known: the error that two orders tell of the own particles.
     """
-    fitted, kinks = fits(run, values), beyond_kinks(run, values)
-    found = np.maximum(unmet(run, values, fitted)[0], _faint(run, values, known, fitted))
+    kinks = beyond_kinks(run, values)
+    found = np.maximum(unmet(run, values)[0], _faint(run, values, known))
     return found if kinks is None else np.maximum(found, kinks)
 
 
-def fits(run: Any, values: np.ndarray) -> Fits:
-    """The local polynomials (N, F, K) of the values, made when they are asked for, and once."""
-    return cache(lambda: run.fitted(run.nums, values))
-
-
-def _faint(run: Any, values: np.ndarray, known: np.ndarray, fitted: Fits) -> np.ndarray:
+def _faint(run: Any, values: np.ndarray, known: np.ndarray) -> np.ndarray:
     """What is made of values that are hardly out of reach, no more of it than two orders make likely."""
     if run.disc.rec.order <= 3 or run.disc.scheme.method not in ("S", "III"):
         return np.zeros(run.disc.held.shape)
-    made, told = _unmet(run, values, FAINT, fitted)[0], whole(run.disc)
+    made, told = _unmet(run, values, FAINT)[0], whole(run.disc)
     size = told.norm(told.own(made))
     return made if size == 0 else made * min(1.0, TRUSTED * told.norm(known) / size)
 
 
-def unmet(run: Any, values: np.ndarray, fitted: Fits) -> tuple[np.ndarray, np.ndarray]:
+def unmet(run: Any, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """What values out of reach make of the solution of a run, (N, F), and the particles whose polynomials these are.
 
     Nothing in the least-squares form, which has a misfit of its own, nor of method SSPH and of I and II, whose
@@ -67,24 +60,30 @@ def unmet(run: Any, values: np.ndarray, fitted: Fits) -> tuple[np.ndarray, np.nd
     """
     if run.disc.scheme.method not in ("S", "III"):
         return np.zeros(run.disc.held.shape), np.zeros(0, int)
-    return _unmet(run, values, LOST[run.disc.rec.order > 3], fitted)
+    return _unmet(run, values, LOST[run.disc.rec.order > 3])
 
 
-def far_out(run: Any, values: np.ndarray, fitted: Fits) -> tuple[np.ndarray, np.ndarray]:
+def far_out(run: Any, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The same of values that are missed by far, each by as much as the nearest are: of any method.
 
     Where held values have no part in the solution its weights are nothing, and so is what they miss.
     """
-    return _unmet(run, values, FAR, fitted, plain=True)
+    return _unmet(run, values, FAR, plain=True)
 
 
-def _unmet(
-    run: Any, values: np.ndarray, lost: float, fitted: Fits, plain: bool = False
-) -> tuple[np.ndarray, np.ndarray]:
+def _unmet(run: Any, values: np.ndarray, lost: float, plain: bool = False) -> tuple[np.ndarray, np.ndarray]:
     if run.formulation == "lsq" or run.rows is None or run.factor is None:
         return np.zeros(run.disc.held.shape), np.zeros(0, int)
-    defects = missed(run.disc, run.rows, values, fitted(), lost, plain)
+    defects = _misses(run, values).of(lost, plain)
     return made_of(run, defects if plain else TIMES * defects)
+
+
+def _misses(run: Any, values: np.ndarray) -> Misses:
+    """What the polynomials of the values leave of their neighbours, kept with the run for the next who asks."""
+    fitted, known = run.fitted(run.nums, values), run.misses
+    if known is None or known.fitted is not fitted:
+        run.misses = known = Misses(run.disc, run.rows, values, fitted)
+    return known
 
 
 def made_of(run: Any, defects: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -97,38 +96,66 @@ def made_of(run: Any, defects: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return solved_alone(run, defects[free]), np.flatnonzero((free & (defects > NAMED * most)).any(axis=1))
 
 
-def missed(
-    disc: Discretization, rows: tuple[list[Class], list[Row]], values: np.ndarray, fitted: np.ndarray, lost: float,
-    plain: bool = False,
-) -> np.ndarray:  # fmt: skip
-    """What predictions (N, F) of polynomials that do not reach their nearest neighbours miss, zero elsewhere.
+class Misses:
+    """What the local polynomials (N, F, K) leave of their neighbours' values (N, F).
 
-    A prediction is a weighted sum of the neighbours' values, and what the polynomial leaves of them no more than noise
-    to it. plain: the mean that is left of the nearest in its place. values (N, F), fitted (N, F, K): the polynomials.
+    Looked at once, for all who ask; predictions are looked at when they are asked for.
     """
-    points, out = np.asarray(disc.points, float), np.zeros(disc.held.shape)
-    at = lambda other: values[np.asarray(disc.images.owners(other))]
 
-    def left(ids: np.ndarray, other: np.ndarray) -> np.ndarray:
+    def __init__(
+        self, disc: Discretization, rows: tuple[list[Class], list[Row]], values: np.ndarray, fitted: np.ndarray
+    ):
+        self.disc, self.values, self.fitted = disc, values, fitted
+        self.points = np.asarray(disc.points, float)
+        self.parts = [_OfClass(self, cls, row) for cls, row in zip(*rows)]
+
+    def at(self, other: np.ndarray) -> np.ndarray:
+        """The values (n, F) of particles, images among them."""
+        return self.values[np.asarray(self.disc.images.owners(other))]
+
+    def left(self, ids: np.ndarray, other: np.ndarray) -> np.ndarray:
         """What polynomials at particles (n,) leave of the values of others (n,), (n, F)."""
-        terms = monomials_on_host((points[other] - points[ids]).T, disc.rec.reach)[: fitted.shape[2]]
-        away = np.abs(np.einsum("nfk,kn->nf", fitted[ids], terms) - at(other))
+        terms = monomials_on_host((self.points[other] - self.points[ids]).T, self.disc.rec.reach)
+        away = np.abs(np.einsum("nfk,kn->nf", self.fitted[ids], terms[: self.fitted.shape[2]]) - self.at(other))
         return np.where((other != ids)[:, None], away, 0.0)
 
-    for cls, row in zip(*rows):
-        nearest = nearest_of(disc, cls, 2 * disc.rec.dim)
+    def of(self, lost: float, plain: bool = False) -> np.ndarray:
+        """What predictions (N, F) of polynomials that do not reach their nearest neighbours miss, zero elsewhere.
+
+        A prediction is a weighted sum of the neighbours' values, and what the polynomial leaves of them no more than
+        noise to it. plain: the mean that is left of the nearest in its place.
+        """
+        out = np.zeros(self.disc.held.shape)
+        for part in self.parts:
+            out[part.ids] = part.of(lost, plain)
+        return out
+
+
+class _OfClass:
+    """The same of the particles of a class."""
+
+    def __init__(self, whole: Misses, cls: Class, row: Row):
+        self.whole, self.cls, self.row, self.ids = whole, cls, row, cls.ids
+        nearest = nearest_of(whole.disc, cls, 2 * whole.disc.rec.dim)
         nearest = np.where(nearest >= 0, nearest, cls.ids[:, None])
-        off = np.stack([left(cls.ids, other) for other in nearest.T])
-        change = np.stack([np.abs(at(other) - values[cls.ids]) for other in nearest.T]).max(axis=0)
-        bad = np.flatnonzero((off.max(axis=0) > lost * change).any(axis=1))
-        if not len(bad):
-            continue
-        total = off[:, bad].mean(axis=0)
-        if not plain:
-            near = np.where(np.asarray(cls.neighbours) >= 0, cls.neighbours, cls.ids[:, None])[bad]
-            weights = np.abs(np.asarray(row.weights)[bad])
-            parts = [np.einsum("nfg,ng->nf", weights[:, :, k], left(cls.ids[bad], other))
-                     for k, other in enumerate(near.T)]  # fmt: skip
-            total = np.linalg.norm(parts, axis=0)
-        out[cls.ids[bad]] = np.where((off.max(axis=0) > lost * change)[bad], total, 0.0)
-    return out
+        off = np.stack([whole.left(cls.ids, other) for other in nearest.T])
+        self.most, self.mean = off.max(axis=0), off.mean(axis=0)
+        self.change = np.stack([np.abs(whole.at(other) - whole.values[cls.ids]) for other in nearest.T]).max(axis=0)
+        self.predicted = np.full(self.mean.shape, np.nan)
+
+    def of(self, lost: float, plain: bool) -> np.ndarray:
+        bad = self.most > lost * self.change
+        if plain:
+            return np.where(bad, self.mean, 0.0)
+        new = np.flatnonzero(bad.any(axis=1) & np.isnan(self.predicted).any(axis=1))
+        if len(new):
+            self.predicted[new] = self._predictions(new)
+        return np.where(bad, self.predicted, 0.0)
+
+    def _predictions(self, some: np.ndarray) -> np.ndarray:
+        """What the predictions of some of them miss, (m, F)."""
+        ids, near = self.ids[some], np.asarray(self.cls.neighbours)[some]
+        near = np.where(near >= 0, near, ids[:, None])
+        weights = np.abs(np.asarray(self.row.weights)[some])
+        parts = [np.einsum("nfg,ng->nf", weights[:, :, k], self.whole.left(ids, at)) for k, at in enumerate(near.T)]
+        return np.linalg.norm(parts, axis=0)

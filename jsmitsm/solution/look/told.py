@@ -9,7 +9,7 @@ import numpy as np
 from jsmitsm.discretization.parts.whole import whole
 from jsmitsm.runtime.errors import some
 from jsmitsm.solution.look.between import between, even, seam, unseen_data
-from jsmitsm.solution.look.reach import Fits, far_out, fits, unmet
+from jsmitsm.solution.look.reach import far_out, unmet
 from jsmitsm.solution.look.sizes import share
 
 # An estimated error below this part of the solution clears what only suspects the resolution ...
@@ -30,20 +30,20 @@ def unseen(
 
     cleared: by cheap tests, without an estimate; narrow: the source is not resolved, as they say.
     """
-    disc, every, fitted = run.disc, whole(run.disc), fits(run, values)
+    disc, every = run.disc, whole(run.disc)
     part = lambda missed: share(every.own(missed), every.own(values), told=every)
-    found["missed"] = missed = 0.0 if cleared and even(run) else part(between(run, fitted))
+    found["missed"] = missed = 0.0 if cleared and even(run) else part(between(run, values))
     found["seam"] = beyond = part(seam(run, values))
     told = list[str]()
     # Constant coefficients degenerate nowhere, and layers that fall to nothing within the spacing may be right.
     if not (disc.linear and disc.traced.constant):
-        told += out_of_reach(run, values, found, cleared, fitted)
+        told += out_of_reach(run, values, found, cleared)
     if missed > (AGREED if narrow else MISSED):
         told.append(
             f"Between the particles the equation is missed by as much as makes {missed:.0%} of the solution: the "
             "source or a coefficient changes within the spacing, unseen by the particles; refine there, or smooth it."
         )
-    told += data(run, values, found, fitted)
+    told += data(run, values, found)
     if beyond > CLEARED:
         told.append(
             f"The equation is not the same on both sides of a periodic pair, which makes {beyond:.0%} of the solution: "
@@ -52,12 +52,12 @@ def unseen(
     return told
 
 
-def data(run: Any, values: np.ndarray, found: dict[str, float], fitted: Fits) -> list[str]:
+def data(run: Any, values: np.ndarray, found: dict[str, float]) -> list[str]:
     """Of boundary data between the particles; where these seem not to see them, the polynomials are asked."""
     every = whole(run.disc)
     made = share(every.own(unseen_data(run)), every.own(values), told=every)
     if made > DATA:
-        made = share(every.own(unseen_data(run, fitted())), every.own(values), told=every)
+        made = share(every.own(unseen_data(run, run.fitted(run.nums, values))), every.own(values), told=every)
     found["data"] = made
     if made <= DATA:
         return []
@@ -67,16 +67,14 @@ def data(run: Any, values: np.ndarray, found: dict[str, float], fitted: Fits) ->
     ]
 
 
-def out_of_reach(
-    run: Any, values: np.ndarray, found: dict[str, float], alone: bool = True, fitted: Fits | None = None
-) -> list[str]:
+def out_of_reach(run: Any, values: np.ndarray, found: dict[str, float], alone: bool = True) -> list[str]:
     """Of values that the polynomials of their neighbours do not reach; alone: without an estimate."""
-    every, fitted = whole(run.disc), fitted or fits(run, values)
-    made, at = (unmet if alone else far_out)(run, values, fitted)
+    every = whole(run.disc)
+    made, at = (unmet if alone else far_out)(run, values)
     part, most = share(every.own(made), every.own(values), told=every), CLEARED if alone else REACHED
     found["unmet"], at = part, every.named(at)
     if part <= most and alone:
-        return out_of_reach(run, values, found, False, fitted)
+        return out_of_reach(run, values, found, False)
     if part <= most:
         return []
     return [

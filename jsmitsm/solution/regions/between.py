@@ -19,7 +19,7 @@ from jsmitsm.solution.look.between import (
     unresolved,
     with_source,
 )
-from jsmitsm.solution.look.reach import LOST, TIMES, made_of, missed
+from jsmitsm.solution.look.reach import LOST, TIMES, Misses, made_of
 from jsmitsm.solution.look.sizes import share
 from jsmitsm.solution.look.told import CLEARED, DATA, MISSED
 
@@ -63,7 +63,8 @@ def out_of_reach(run: Any, values: np.ndarray) -> np.ndarray:
     expanded = np.asarray(whole_coefficients(disc, run.nums, values), float)
     for part, rows in zip(disc.parts, run.parts):
         if part.name not in run.squared:
-            defects[part.ids] = missed(part.disc, rows, values[part.ids], expanded[part.ids], LOST[disc.rec.order > 3])
+            misses = Misses(part.disc, rows, values[part.ids], expanded[part.ids])
+            defects[part.ids] = misses.of(LOST[disc.rec.order > 3])
     return made_of(run, TIMES * defects)[0]
 
 
