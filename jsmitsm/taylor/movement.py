@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm.taylor.elementwise import rule
-from jsmitsm.taylor.series import Array, Ring, choose, on_host, take, unify, xp_of
+from jsmitsm.taylor.series import Array, Ring, choose, on_host, pad_to, take, unify, xp_of
 
 
 def _shape(eqn: Any) -> tuple[int, ...]:
@@ -96,20 +96,22 @@ def _pool(*vals: Array) -> tuple[Array, list[int]]:
 
 @rule("pad")
 def _pad(ring: Ring, eqn: Any, x: Array, value: Array) -> Array:
-    # np.pad knows neither interior nor negative padding: place the element numbers instead.
-    shape = _shape(eqn)
-    places = np.full(shape, math.prod(x.shape[1:-1]))
-    own = np.arange(places.flat[0] if places.size else 0).reshape(x.shape[1:-1])
-    source, target = [], []
+    shape, source, target = _shape(eqn), [slice(None)], [slice(None)]
     for size, out, (low, _, inner) in zip(x.shape[1:-1], shape, eqn.params["padding_config"], strict=True):
-        at = low + np.arange(size) * (inner + 1)
-        source.append(np.flatnonzero((at >= 0) & (at < out)))
-        target.append(at[source[-1]])
-    if shape:
-        places[np.ix_(*target)] = own[np.ix_(*source)]
-    else:
-        places[...] = 0
-    return take(_pool(x, value)[0], places[..., None])
+        step = inner + 1
+        first, end = max(0, -(low // step)), min(size, -(-(out - low) // step))  # those that come to lie within
+        source.append(slice(first, max(first, end)))
+        target.append(slice(low + first * step, max(low + end * step - inner, low + first * step), step))
+    batch = max(x.shape[-1], value.shape[-1])
+    terms = max(x.shape[0], value.shape[0])
+    value = value.reshape(value.shape[0], *(1,) * len(shape), value.shape[-1])
+    if on_host(x, value):
+        out = np.zeros((terms, *shape, batch), x.dtype)
+        out[: len(value)] = value
+        out[tuple(target)] = pad_to(x, terms)[tuple(source)]
+        return out
+    every = jnp.broadcast_to(pad_to(value, terms), (terms, *shape, batch))
+    return jnp.asarray(every).at[tuple(target)].set(pad_to(x, terms)[tuple(source)])
 
 
 def _strides(shape: tuple[int, ...]) -> list[int]:

@@ -147,6 +147,17 @@ def product_rows(dim: int, left: int, right: int, degree: int) -> tuple[tuple[in
 
 
 @cache
+def product_runs(dim: int, left: int, right: int, degree: int) -> tuple[tuple[tuple[int, int, int], ...], ...]:
+    """The same places as runs (place of the first, first and end among the right factor's terms) without a gap."""
+    runs = []
+    for n, places in product_rows(dim, left, right, degree):
+        at = np.arange(places.start, places.stop) if isinstance(places, slice) else np.array(places if n else [], int)
+        ends = [0, *(np.flatnonzero(np.diff(at) != 1) + 1).tolist(), len(at)]
+        runs.append(tuple((int(at[low]), low, high) for low, high in zip(ends, ends[1:]) if high > low))
+    return tuple(runs)
+
+
+@cache
 def block_rows(dim: int, left: int, right: int) -> tuple[Any, ...]:
     """For each index a of degree ``left``: places of a + b in degree left + right, all |b| = right."""
     place = {c: i for i, c in enumerate(_of_degree(dim, left + right))}

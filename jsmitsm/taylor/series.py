@@ -14,10 +14,13 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from jsmitsm.taylor.multi_indices import block_rows, count, degree_of_count, degrees, powers, product_rows
+from jsmitsm.taylor.multi_indices import block_rows, count, degree_of_count, degrees, powers, product_rows, product_runs
 from jsmitsm.taylor.pairing import pairing, product
 
 Array = Any
+
+# Rows of so many numbers are added up in place.
+_LONG = 512
 
 
 class Ring(NamedTuple):
@@ -112,7 +115,11 @@ def mul(ring: Ring, x: Array, y: Array) -> Array:
         ours, theirs = _filled_rows(x), _filled_rows(y)
         if len(ours) > len(theirs):
             x, y, left, right, ours, theirs = y, x, right, left, theirs, ours
-        rows, sparse = product_rows(ring.dim, left, right, degree), 2 * len(theirs) < len(y)
+        sparse = 2 * len(theirs) < len(y)
+        if not sparse and y[0].size >= _LONG:
+            _add_products(out, x, y, ours, product_runs(ring.dim, left, right, degree))
+            return out
+        rows = product_rows(ring.dim, left, right, degree)
         for a in ours:
             n, places = rows[a]
             if n and sparse:
@@ -122,6 +129,19 @@ def mul(ring: Ring, x: Array, y: Array) -> Array:
             elif n:
                 out[places] += x[a] * y[:n]
     return out
+
+
+def _add_products(out: np.ndarray, x: np.ndarray, y: np.ndarray, ours: np.ndarray, runs: Any) -> None:
+    """Add x y to ``out``, by runs of rows: no array is made but one, which long rows would take time to be given."""
+    product = np.empty((len(y), *out.shape[1:]), out.dtype)
+    for a in ours:
+        if not runs[a]:
+            continue
+        n = runs[a][-1][2]
+        part = np.multiply(x[a], y[:n], out=product[:n])
+        for first, low, high in runs[a]:
+            place = out[first : first + high - low]
+            np.add(place, part[low:high], out=place)
 
 
 def _filled_rows(x: np.ndarray) -> np.ndarray:
