@@ -155,7 +155,8 @@ def _repaired(
     best = _Best(Row(*map(np.concatenate, zip(*rows))), near, bool(scheme.n_own))
     width = min(len(points), round(2.2 * size))
     kept = {} if disc.walls is None else disc.walls.kept
-    for number, attempt in enumerate((wider(1.5), wider(2.2), balanced(1.0), balanced(1.5), balanced(2.2))):
+    around = _Pool(points, 10 * size, disc.walls)
+    for number, attempt in enumerate((wider(1.5), wider(2.2), *(balanced(x, around) for x in (1.0, 1.5, 2.2)))):
         left = np.flatnonzero(best.lebesgue > LEBESGUE)
         if not len(left):
             break
@@ -272,12 +273,27 @@ def wider(factor: float):
     return attempt
 
 
-def balanced(factor: float):
-    """At least a sixteenth of the neighbours from each of eight directions (two in 1D)."""
+class _Pool:
+    """The nearest ``count`` neighbours of particles, searched once for those first asked for and fewer of them."""
+
+    def __init__(self, points: np.ndarray, count: int, walls: Walls | None):
+        self.points, self.count, self.walls = points, min(len(points), count), walls
+        self.row: dict[int, int] = {}
+        self.near = np.zeros((0, 0), int)
+
+    def of(self, ids: np.ndarray) -> np.ndarray:
+        if not all(i in self.row for i in ids.tolist()):
+            self.near = np.asarray(nearest_seen(self.points, self.count, ids, self.walls).indices)
+            self.row = {i: k for k, i in enumerate(ids.tolist())}
+        return self.near[[self.row[i] for i in ids.tolist()]]
+
+
+def balanced(factor: float, around: _Pool | None = None):
+    """At least a sixteenth of the neighbours from each of eight directions (two in 1D); around: who is near."""
 
     def attempt(points: np.ndarray, ids: np.ndarray, size: int, walls: Walls | None) -> np.ndarray:
         total = min(len(points), round(factor * size))
-        pool = nearest_seen(points, min(len(points), 10 * size), ids, walls).indices
+        pool = (around or _Pool(points, 10 * size, walls)).of(ids)
         offset = points[np.maximum(pool, 0)] - points[ids][:, None]
         away = np.where(pool >= 0, np.linalg.norm(offset, axis=2), np.inf)
         order = np.argsort(away, axis=1, kind="stable")
