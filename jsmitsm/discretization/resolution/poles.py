@@ -35,6 +35,8 @@ FOUND, SHORTER = 1e-5, 1e-2
 # After so many steps the way is a part of what it was that is far below this, or leads to no pole. Of 700 on their ways
 # to poles, wherever they began, none had more left than a millionth.
 SOON, STILL = 8, 0.5
+# Who has gone so many times as far as the support reaches is on the way to none, or to one that does not count.
+ASTRAY = 2.0
 # A value nearer to a pole than this part of the spacing is taken so far away: about the mean over a particle's share of
 # space, of 1 / r in 2D and 3D, of its root on a line.
 NEAREST = {1: 0.12, 2: 0.3, 3: 0.4}
@@ -194,14 +196,20 @@ class _Ways:
         """
         new = ids[np.isnan(self.left[ids])]
         if len(new):
-            self.at[new], self.first[new], self.left[new] = _approached(valued, self.start[new])
+            far = ASTRAY * reach[np.isnan(self.left[ids])]
+            self.at[new], self.first[new], self.left[new] = _approached(valued, self.start[new], far)
         at, left = self.at[ids], self.left[ids]
         shorter = (left < FOUND * reach) & (left < SHORTER * self.first[ids])
         return at, shorter & (np.linalg.norm(at - self.start[ids], axis=1) < reach)
 
 
-def _approached(valued: Callable[..., Any], points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Where |v| leads to from points (m, D) by Newton's method for 1 / v = 0, and how far it was and is to there."""
+def _approached(
+    valued: Callable[..., Any], points: np.ndarray, far: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
+    """Where |v| leads to from points (m, D) by Newton's method for 1 / v = 0, and how far it was and is to there.
+
+    Who has gone as far (m,) goes no farther.
+    """
 
     def looked(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """|v| (...,) and the way to a pole of first order (..., D), none where v is infinite."""
@@ -226,6 +234,7 @@ def _approached(valued: Callable[..., Any], points: np.ndarray) -> tuple[np.ndar
         better = sizes[best] > size[moving]
         best, moving = (best[0][better], best[1][better]), moving[better]  # who gets no nearer never will
         size[moving], at[moving], way[moving] = sizes[best], tried[best], ways[best]
+        moving = moving[np.linalg.norm(at[moving] - points[moving], axis=1) < far[moving]]
     left = np.linalg.norm(way, axis=1)
     return at, first, np.where(np.isnan(left), np.inf, left)
 
