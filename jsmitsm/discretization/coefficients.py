@@ -15,7 +15,7 @@ from jsmitsm.discretization.degenerate import Degenerate, settled
 from jsmitsm.discretization.layout import Discretization, crowded
 from jsmitsm.discretization.periodic import with_corners
 from jsmitsm.discretization.resolution.kinks import softened
-from jsmitsm.discretization.resolution.poles import Poles, without_poles
+from jsmitsm.discretization.resolution.poles import Poles, joined, without_poles
 from jsmitsm.equation.conditions import group_conditions, merged
 from jsmitsm.equation.problem import Problem
 from jsmitsm.equation.traced import Traced
@@ -74,17 +74,38 @@ def numbers(disc: Discretization, problem: Problem, taylor: Any = None, everywhe
     everywhere = everywhere or disc.scheme.method in ("I", "II")  # neighbours recover derivatives too
     ids = np.arange(len(disc.cloud)) if everywhere else disc.active
     here = None if taylor is None else picked(taylor, ids)
-    jac, source = operator_numbers(disc, problem, ids, here)
-    poles = None
-    if disc.linear:
-        jac, source, poles = without_poles(disc, problem, ids, jac, source)
-    if disc.rec.depth and disc.linear and disc.traced.source == "variable":
-        source = _softened(disc, problem, ids, source)
+    jac, source, poles = _judged_numbers(disc, problem, ids, here)
     held = _held_values(disc)
     own_ids, own, given = _own_numbers(disc, held, taylor)
     data, gamma = _data_numbers(disc, taylor)
     made = Numbers(ids, jac, source, own_ids, own, given, _at(disc, held), data, gamma, poles=poles)
     return settled(disc, problem, made)
+
+
+def _judged_numbers(disc: Discretization, problem: Problem, ids: np.ndarray, taylor: Any) -> tuple[Any, Any, Any]:
+    """Operator and source at particles, without the series that end within a support, and the poles beside these."""
+    jac, source = operator_numbers(disc, problem, ids, taylor)
+    poles = None
+    if disc.linear:
+        jac, source, poles = without_poles(disc, problem, ids, jac, source)
+    if disc.rec.depth and disc.linear and disc.traced.source == "variable":
+        source = _softened(disc, problem, ids, source)
+    return jac, source, poles
+
+
+def judge_again(disc: Discretization, nums: Numbers, ids: np.ndarray) -> None:
+    """Replace the series of sources at particles whose supports have become wider by what reaches that far."""
+    traced = disc.traced
+    varies = disc.linear and traced.source == "variable" and np.shape(nums.source)[-1] > 1
+    if not varies or not len(ids) or nums.degenerate is not None or not (traced.kinked_source or traced.unbounded[0]):
+        return
+    ids = np.intersect1d(ids, nums.ids)
+    some = [(cls, np.isin(cls.ids, ids)) for cls in disc.classes]
+    classes = [replace(cls, ids=cls.ids[at], neighbours=cls.neighbours[at]) for cls, at in some if at.any()]
+    _, source, poles = _judged_numbers(replace(disc, classes=classes), disc.problem, ids, None)
+    nums.source = np.array(nums.source)
+    nums.source[:, np.searchsorted(nums.ids, ids)] = source
+    nums.poles = joined(nums.poles, poles)
 
 
 def _softened(disc: Discretization, problem: Problem, ids: np.ndarray, source: Any) -> Any:

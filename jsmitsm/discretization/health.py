@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from jsmitsm.cloud.sight.walls import Walls, nearest_seen
-from jsmitsm.discretization.coefficients import Numbers
+from jsmitsm.discretization.coefficients import Numbers, judge_again
 from jsmitsm.discretization.layout import Class, Discretization, rounded_width
 from jsmitsm.discretization.local_data import shared_elimination
 from jsmitsm.discretization.rows import class_moment_matrices, class_rows
@@ -105,8 +105,9 @@ def repaired(
                 new_classes.append(cls)
                 new_rows.append(row)
                 touched.append(changed)
-    after = examine(new_classes, new_rows)
-    return new_classes, new_rows, replace(after, repaired=np.concatenate(touched))
+    changed = np.concatenate(touched)
+    judge_again(replace(disc, classes=new_classes), nums, changed)
+    return new_classes, new_rows, replace(examine(new_classes, new_rows), repaired=changed)
 
 
 def _sizes(disc: Discretization, pieces: dict[Any, list[tuple[Class, Row, np.ndarray]]]) -> dict[Any, int]:

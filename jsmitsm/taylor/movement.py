@@ -97,9 +97,9 @@ def _pool(*vals: Array) -> tuple[Array, list[int]]:
 @rule("pad")
 def _pad(ring: Ring, eqn: Any, x: Array, value: Array) -> Array:
     shape, source, target = _shape(eqn), [slice(None)], [slice(None)]
-    for size, out, (low, _, inner) in zip(x.shape[1:-1], shape, eqn.params["padding_config"], strict=True):
+    for size, whole, (low, _, inner) in zip(x.shape[1:-1], shape, eqn.params["padding_config"], strict=True):
         step = inner + 1
-        first, end = max(0, -(low // step)), min(size, -(-(out - low) // step))  # those that come to lie within
+        first, end = max(0, -(low // step)), min(size, -(-(whole - low) // step))  # those that come to lie within
         source.append(slice(first, max(first, end)))
         target.append(slice(low + first * step, max(low + end * step - inner, low + first * step), step))
     batch = max(x.shape[-1], value.shape[-1])

@@ -57,6 +57,14 @@ class Poles(NamedTuple):
     missed: np.ndarray
 
 
+def joined(known: Poles | None, found: Poles | None) -> Poles | None:
+    """What is known of poles beside particles, and what was found beside others."""
+    if known is None or found is None:
+        return known or found
+    new = ~np.isin(found.ids, known.ids)
+    return Poles(*(np.concatenate([a, b[new]]) for a, b in zip(known, found)))
+
+
 def said(found: Poles | None, told: Whole = ALONE) -> list[str]:
     """A sentence on poles, if there are any; ``told``: of the cloud that several processes share."""
     at = told.together(np.zeros((0, 0)) if found is None else found.at)
