@@ -9,7 +9,6 @@ import pytest
 
 import jsmitsm as js
 from jsmitsm.solution.look.between import unseen_data
-from jsmitsm.solution.look.reach import fits
 
 ENDS = {"left": js.dirichlet(0.0), "right": js.dirichlet(0.0)}
 SIDES = ("left", "right", "bottom", "top")
@@ -84,7 +83,7 @@ def test_polynomials_see_resolved_data_between_the_particles(data, part):
     bcs = {g: js.dirichlet(0.0) for g in SIDES} | {"bottom": js.dirichlet(data)}
     sol = js.solve(js.Problem(lambda u, x: js.laplacian(u)(x), bcs), cloud, order=6)
     run, values = sol._report, np.asarray(sol.u)[:, None]
-    plain, asked = unseen_data(run).max(), unseen_data(run, fits(run, values)()).max()
+    plain, asked = unseen_data(run).max(), unseen_data(run, run.fitted(run.nums, values)).max()
     assert plain > 1e-3 and part[0] * plain <= asked <= part[1] * plain
 
 

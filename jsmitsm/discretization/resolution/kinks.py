@@ -19,6 +19,8 @@ from jsmitsm.taylor.multi_indices import multi_indices
 BETTER, MISLED, FAINT, DIVERGED = 0.5, 3.0, 1e-6, 3.0
 DEGREE = 2
 RIDGE = 1e-10
+# Where a value is held a source is as good as infinite from so many times any value around on.
+BEYOND = 100.0
 
 
 def softened(disc: Discretization, ids: np.ndarray, source: Any, values: Any) -> Any:
@@ -36,7 +38,7 @@ def softened(disc: Discretization, ids: np.ndarray, source: Any, values: Any) ->
         (degree, tuple(k for k, (e, _) in enumerate(row_index) if e == equation))
         for equation, degree in enumerate(disc.rec.degrees)
     )
-    return _softened(source, values, disc.points, classes, equations)
+    return _softened(source, values, disc.points, classes, disc.held.all(axis=1), equations)
 
 
 def _owners(disc: Discretization, cls: Class) -> Any:
@@ -51,7 +53,9 @@ def offsets(points: Any, ids: Any, near: Any, xp: Any) -> Any:
 
 
 @partial(in_one_program, static=("equations",))
-def _softened(source: Any, values: Any, points: Any, classes: list[Any], equations: tuple[Any, ...]) -> Any:
+def _softened(
+    source: Any, values: Any, points: Any, classes: list[Any], held: np.ndarray, equations: tuple[Any, ...]
+) -> Any:  # fmt: skip
     """classes: of each one its ids, their places in the source, neighbours and owners; equations: degree and rows."""
     xp = jnp if is_traced(source, values, points, classes) else np
     source, values, points = xp.array(source), xp.asarray(values), xp.asarray(points)
@@ -59,7 +63,8 @@ def _softened(source: Any, values: Any, points: Any, classes: list[Any], equatio
         offset = offsets(points, ids, near, xp)
         for there, (degree, rows) in zip(values, equations):
             some = np.array(rows)[:, None], at
-            new = _judged(offset, near >= 0, there[whose], degree, source[some], xp)
+            counts = _telling(near >= 0, there[whose], xp.asarray(held)[whose], xp)
+            new = _judged(offset, counts, there[whose], degree, source[some], xp)
             if xp is np:
                 source[some] = new
             else:
@@ -67,9 +72,19 @@ def _softened(source: Any, values: Any, points: Any, classes: list[Any], equatio
     return source
 
 
+def _telling(valid: Any, there: Any, held: Any, xp: Any) -> Any:
+    """Which of the source's values (n, w) at neighbours tell of it around.
+
+    Not the infinite ones, on the boundary, nor what is as good as infinite: beyond any value at a particle with an
+    equation, where the value is held.
+    """
+    size = xp.where(valid & xp.isfinite(there), xp.abs(there), 0.0)
+    most = xp.max(xp.where(held, 0.0, size), axis=1, keepdims=True)
+    return valid & xp.isfinite(there) & ~(held & (size > BEYOND * most) & (most > 0.0))
+
+
 def _judged(offset: Any, valid: Any, there: Any, degree: int, series: Any, xp: Any) -> Any:
     """The series (T, n) of one equation's source, or what is fitted to its values (n, w) at the offsets (n, w, D)."""
-    valid = valid & xp.isfinite(there)  # a source may be infinite on the boundary
     there = xp.where(valid, there, 0.0)
     count = xp.maximum(xp.sum(valid, axis=1), 1)
     mean = lambda x: xp.sum(xp.where(valid, x, 0.0) ** 2, axis=1) / count
