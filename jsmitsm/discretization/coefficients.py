@@ -14,7 +14,7 @@ from jsmitsm.cloud.cloud import Cloud, kept
 from jsmitsm.discretization.degenerate import Degenerate, settled
 from jsmitsm.discretization.layout import Discretization, crowded
 from jsmitsm.discretization.periodic import with_corners
-from jsmitsm.discretization.resolution.kinks import softened
+from jsmitsm.discretization.resolution.kinks import endless, softened
 from jsmitsm.discretization.resolution.poles import Poles, joined, without_poles
 from jsmitsm.equation.conditions import group_conditions, merged
 from jsmitsm.equation.problem import Problem
@@ -115,7 +115,7 @@ def _softened(disc: Discretization, problem: Problem, ids: np.ndarray, source: A
     at = lambda x: -disc.traced.residuals(x, params=problem.params)
     points, values = disc.cloud.points, at(disc.cloud.points)
     if not is_traced(values):
-        seen = disc.traced.kinked_source or not np.isfinite(values).all()
+        seen = disc.traced.kinked_source or endless(values, disc.held.all(axis=1))
         return softened(disc, ids, source, values) if seen else source
     finite = jnp.isfinite(values).all(axis=0)
     # Derivatives of what is infinite are not asked for: times nothing they would not be nothing.

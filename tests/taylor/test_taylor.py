@@ -205,3 +205,23 @@ def test_evaluate_prunes_what_is_not_wanted():
     closed = jax.make_jaxpr(lambda x: (jnp.sin(x[0]), jnp.cos(x[0])))(jax.ShapeDtypeStruct((1,), float))
     out = evaluate(closed.jaxpr, closed.consts, [variable(np.zeros((2, 1)), 3)], 1, 3, np, [0, 1])
     assert out[0] is None and out[1].shape == (1, 2)
+
+
+@pytest.mark.parametrize("low, high, inner", [(2, 0, 0), (-1, 2, 0), (-2, -1, 0), (1, 1, 2), (-3, 4, 1), (-1, -2, 2)])
+def test_padding_of_any_sign(low, high, inner):
+    parts = lambda x: jnp.stack([x[0], x[0] * x[1], jnp.sin(x[1]), 2.0 + 0.0 * x[0], x[1] ** 2])
+    padded = lambda x: jax.lax.pad(parts(x), jnp.asarray(7.0), [(low, high, inner)])
+    points = np.random.default_rng(0).uniform(0.3, 0.9, (5, 2))
+    found = taylor_coefficients(padded, points, 3)
+    np.testing.assert_allclose(found[0], jax.vmap(padded)(points).T, rtol=1e-14)
+    np.testing.assert_allclose(found[1], jax.vmap(jax.jacfwd(padded))(points)[..., 0].T, rtol=1e-13, atol=1e-15)
+    np.testing.assert_allclose(found, jax.jit(lambda p: taylor_coefficients(padded, p, 3))(points), rtol=1e-13, atol=1e-15)
+
+
+@pytest.mark.parametrize("dim, left, right, degree", [(1, 5, 7, 9), (2, 6, 6, 6), (2, 3, 8, 10), (3, 4, 5, 6)])
+def test_long_rows_are_multiplied_as_short_ones(dim, left, right, degree):
+    rng = np.random.default_rng(1)
+    x, y = (rng.normal(size=(count(dim, d), 700)) for d in (left, right))
+    whole = mul(Ring(dim, degree), x, y)
+    parts = [mul(Ring(dim, degree), x[:, k : k + 100], y[:, k : k + 100]) for k in range(0, 700, 100)]
+    np.testing.assert_allclose(whole, np.concatenate(parts, axis=1), rtol=0, atol=1e-13)

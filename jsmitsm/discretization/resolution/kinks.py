@@ -72,6 +72,13 @@ def _softened(
     return source
 
 
+def endless(values: np.ndarray, held: np.ndarray) -> bool:
+    """Whether a source of values (E, N) is infinite, or as good as that where the particles (N,) are held."""
+    size = np.abs(values)
+    there, around = size[:, held].max(axis=1, initial=0.0), size[:, ~held].max(axis=1, initial=0.0)
+    return not np.isfinite(size).all() or bool(((there > BEYOND * around) & (around > 0.0)).any())
+
+
 def _telling(valid: Any, there: Any, held: Any, xp: Any) -> Any:
     """Which of the source's values (n, w) at neighbours tell of it around.
 
