@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 
 from jsmitsm.adaptation.spacing_field import SpacingField
 from jsmitsm.cloud.cloud import Cloud
+from jsmitsm.discretization.coefficients import expect_estimate
 
 # Particles of the first cloud, by dimension: enough for the estimate of a low order, and not more.
 FIRST = {1: 25, 2: 200, 3: 700}
@@ -24,13 +25,14 @@ Make = Callable[[Any], Cloud]
 
 
 def made(make: Make, spacing: Any) -> Cloud:
-    """A cloud from the user's maker; ValueError where it is none."""
+    """A cloud from the user's maker, on which errors will be estimated; ValueError where it is none."""
     cloud = make(spacing)
     if not isinstance(cloud, Cloud):
         raise ValueError(
             f"make: returned {type(cloud).__name__}, expected a js.Cloud; it is called with a spacing, a number or a "
             "function (M, D) -> (M,), as in lambda spacing: js.from_polygon(vertices, spacing)"
         )
+    expect_estimate(cloud)
     return cloud
 
 

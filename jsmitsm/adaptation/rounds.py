@@ -17,7 +17,6 @@ from jsmitsm.adaptation.marking import FAR, ROUGH, SLOW, Marks, marks, next_spac
 from jsmitsm.adaptation.measure import Measured, Quantity, gaps, measured, size, spent
 from jsmitsm.adaptation.spacing_field import SpacingField
 from jsmitsm.cloud.cloud import Cloud
-from jsmitsm.discretization.coefficients import expect_estimate
 from jsmitsm.equation.problem import Problem
 from jsmitsm.runtime.errors import SolveError
 from jsmitsm.solution.solution import Solution
@@ -174,7 +173,6 @@ class Rounds:
 
     def _solved(self, cloud: Cloud, spacing: SpacingField) -> tuple[Solution, Measured]:
         order = self._order(cloud)
-        expect_estimate(cloud)
         sol = self._solve(cloud, order)
         h = spacing(np.asarray(cloud.points))
         found = measured(sol, h, self._operator_order(sol), self.norm, self.quantity)

@@ -30,8 +30,7 @@ from jsmitsm.solution.flags import flags
 from jsmitsm.solution.memory import refuse_too_large
 from jsmitsm.solution.statistics import of_run
 
-# Polynomials of no more numbers are kept for the next who asks.
-KEPT = 20_000_000
+KEPT = 20_000_000  # polynomials of no more numbers stay for the next who asks
 # Under a JAX transform a system is taken for singular whose solution outgrows its right-hand side by so many times the
 # usual condition, and data for unbalanced that leave this part of them: there no other order is compared.
 GROWN, BALANCED = 1e4, 1e-2
@@ -63,8 +62,8 @@ class Run:
         self.rows: tuple[list[Class], list[Row]] | None = None
         self.nums: Numbers | None = None
         self.values: np.ndarray | None = None
-        self._polynomials: tuple[Any, Any, np.ndarray] | None = None  # numbers, values, and what was fitted to them
-        self.misses: Any = None  # what they leave of their neighbours, see ``jsmitsm.solution.look.reach``
+        self._polynomials: Any = None  # numbers, values, and the polynomials fitted to them
+        self.misses: Any = None  # what these leave of their neighbours, see ``look.reach``
         self.extra: Any = None  # of the last step's unknowns those that are no values of particles
 
     def numbers(self, taylor: Any = None) -> Any:
@@ -79,9 +78,8 @@ class Run:
         """The polynomials (N, F, K) of a solution (N, F) at the particles that carry equations, fitted once."""
         known = self._polynomials
         if known is None or known[0] is not nums or not np.array_equal(known[1], values):
-            made = np.asarray(all_coefficients(self.disc, nums, values), float)
-            known = nums, values, made
-            self._polynomials = known if made.size <= KEPT else None
+            known = nums, values, np.asarray(all_coefficients(self.disc, nums, values), float)
+            self._polynomials = known if known[2].size <= KEPT else None
         return known[2]
 
     def operators(self) -> list[tuple[Discretization, Any, np.ndarray]]:

@@ -72,7 +72,7 @@ def _softened(
     return source
 
 
-def endless(values: np.ndarray, held: np.ndarray) -> bool:
+def endless(values: np.ndarray, held: Any) -> bool:
     """Whether a source of values (E, N) is infinite, or as good as that where the particles (N,) are held."""
     size = np.abs(values)
     there, around = size[:, held].max(axis=1, initial=0.0), size[:, ~held].max(axis=1, initial=0.0)
