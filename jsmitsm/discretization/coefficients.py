@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -155,32 +155,42 @@ def _at(disc: Discretization, held: list[dict[int, Any]]) -> Any:
     return _filled(np.zeros(disc.held.shape), places)
 
 
+class _Known(NamedTuple):
+    """Taylor coefficients up to a degree, (..., T, N), or (..., 1, 1) the same for all; and of which particles."""
+
+    degree: int
+    particles: np.ndarray
+    jac: Any = None
+    residual: Any = None
+
+
 class _Series:
     """Taylor coefficients of a linear operator and its residual at the particles of a cloud, as far as was asked."""
 
     def __init__(self, traced: Traced, points: np.ndarray, params: Any):
         self.traced, self.points, self.params = traced, points, params
-        self.degree, self.known = -1, np.zeros(len(points), bool)
-        self.jac: Any = None
-        self.residual: Any = None
+        self.known = _Known(-1, np.zeros(len(points), bool))
 
     def at(self, ids: np.ndarray, degree: int, ahead: int) -> tuple[Any, Any]:
         """Those at particles, see ``Traced.coefficients``; ahead: degrees more that will be asked for soon."""
-        if degree > self.degree:
-            self.degree, self.jac, self.residual = degree + ahead, None, None
-            self.known[:] = False
-        new = ids[~self.known[ids]]
+        known = self.known  # replaced as a whole: solves run in threads too
+        if degree > known.degree:
+            known = _Known(degree + ahead, np.zeros(len(self.points), bool))
+        new = ids[~known.particles[ids]]
         if len(new):
-            jac, residual = self.traced.coefficients(self.points[new], self.degree, params=self.params)
-            self.jac, self.residual = self._with(self.jac, jac, new), self._with(self.residual, residual, new)
-            self.known[new] = True
-        return self._part(self.jac, ids, degree), self._part(self.residual, ids, degree)
+            jac, residual = self.traced.coefficients(self.points[new], known.degree, params=self.params)
+            particles = known.particles.copy()
+            particles[new] = True
+            jac, residual = self._with(known.jac, jac, new), self._with(known.residual, residual, new)
+            self.known = known = _Known(known.degree, particles, jac, residual)
+        return self._part(known.jac, ids, degree), self._part(known.residual, ids, degree)
 
     def _with(self, every: Any, some: Any, ids: np.ndarray) -> Any:
-        """The coefficients of all particles (..., T, N) with those of some (..., T, m)."""
-        if some is None or some.shape[-2:] == (1, 1):  # the same everywhere
+        """The coefficients of all particles with those (..., T, m) of some."""
+        if some is None or some.shape[-2:] == (1, 1):
             return some
-        every = np.zeros((*some.shape[:-1], len(self.points)), some.dtype) if every is None else every
+        shape = (*some.shape[:-1], len(self.points))
+        every = np.zeros(shape, some.dtype) if every is None else every.copy()
         every[..., ids] = some
         return every
 

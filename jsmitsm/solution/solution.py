@@ -123,7 +123,7 @@ class Solution(Anywhere):
 
     def _expanded(self) -> Any:
         run = self._report
-        if not isinstance(self._fit, Fit) or not isinstance(run, Run) or not run.disc.linear or run.nums is None:
+        if not isinstance(self._fit, Fit) or type(run) is not Run or not run.disc.linear or run.nums is None:
             return super()._expanded()
         return self._fit.coefficients(self._values, known=run.fitted(run.nums, np.asarray(self._values, float)))
 

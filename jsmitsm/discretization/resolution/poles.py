@@ -140,6 +140,7 @@ def _sought(
     traced, params = jax.tree.map(concrete, (disc.traced, problem.params))
     reach = _reach(disc, ids)
     points = np.asarray(concrete(disc.cloud.points), float)
+    passing = is_traced(jax.tree.leaves((disc.traced, problem.params)))  # by JAX: nothing of it stays
     asked = "poles", Same(disc.traced), tuple(np.asarray(x).tobytes() for x in jax.tree.leaves(params))
     found, together = {}, np.zeros(len(ids), bool)
     for function in _varying(disc, jac, source):
@@ -148,7 +149,7 @@ def _sought(
         if not len(which):
             continue
         # Another order's series end at other particles, but the ways from them are the same.
-        ways = kept(disc.cloud, (*asked, function), partial(_Ways, points))
+        ways = _Ways(points) if passing else kept(disc.cloud, (*asked, function), partial(_Ways, points))
         at, arrived = ways.met(partial(function.at, traced, params), ids[which], reach[which])
         at, which = at[arrived], which[arrived]
         if function.slot is not None and any(disc.rec.slots[function.slot][1]):
@@ -194,20 +195,23 @@ class _Ways:
     """Where |v| leads to from particles, found for those that are asked for, and once."""
 
     def __init__(self, points: np.ndarray):
-        self.start, self.at = points, points.copy()
-        self.first, self.left = np.zeros(len(points)), np.full(len(points), np.nan)  # what was left to go
+        self.start = points
+        # Where, (N, D), how far it was and is to there, (N,): replaced together, for solves run in threads too.
+        self.ends = points, np.zeros(len(points)), np.full(len(points), np.nan)
 
     def met(self, valued: Callable[..., Any], ids: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Where it leads to from the particles ids (m,), (m, D), and whether it is infinite there, (m,).
 
         Poles outside of the support are none. valued: makes the function's Taylor coefficients at points.
         """
-        new = ids[np.isnan(self.left[ids])]
-        if len(new):
-            far = ASTRAY * reach[np.isnan(self.left[ids])]
-            self.at[new], self.first[new], self.left[new] = _approached(valued, self.start[new], far)
-        at, left = self.at[ids], self.left[ids]
-        shorter = (left < FOUND * reach) & (left < SHORTER * self.first[ids])
+        new = np.isnan(self.ends[2][ids])
+        if new.any():
+            at, first, left = (x.copy() for x in self.ends)
+            found = _approached(valued, self.start[ids[new]], ASTRAY * reach[new])
+            at[ids[new]], first[ids[new]], left[ids[new]] = found
+            self.ends = at, first, left
+        at, first, left = (x[ids] for x in self.ends)
+        shorter = (left < FOUND * reach) & (left < SHORTER * first)
         return at, shorter & (np.linalg.norm(at - self.start[ids], axis=1) < reach)
 
 

@@ -16,7 +16,7 @@ from jsmitsm.discretization.parts.whole import whole
 from jsmitsm.particle.moments import Row
 from jsmitsm.particle.polynomials import monomials_on_host
 from jsmitsm.solution.look.between import beyond_kinks, solved_alone
-from jsmitsm.solution.look.halfway import nearest_of
+from jsmitsm.solution.look.halfway import nearest_of, pairs
 
 # A polynomial does not reach its nearest neighbours where it misses one by this part of the largest change to any of
 # them: 0.1 to 0.5 beside square roots and jumps of data. By order: up to 3, and above.
@@ -155,7 +155,8 @@ class _OfClass:
     def _predictions(self, some: np.ndarray) -> np.ndarray:
         """What the predictions of some of them miss, (m, F)."""
         ids, near = self.ids[some], np.asarray(self.cls.neighbours)[some]
-        near = np.where(near >= 0, near, ids[:, None])
-        weights = np.abs(np.asarray(self.row.weights)[some])
-        parts = [np.einsum("nfg,ng->nf", weights[:, :, k], self.whole.left(ids, at)) for k, at in enumerate(near.T)]
-        return np.linalg.norm(parts, axis=0)
+        weights, square = np.asarray(self.row.weights)[some], np.zeros((len(some), self.whole.values.shape[1]))
+        for row, column in pairs(near):
+            left = self.whole.left(ids[row], near[row, column])
+            np.add.at(square, row, np.einsum("nfg,ng->nf", np.abs(weights[row, :, column]), left) ** 2)
+        return np.sqrt(square)
