@@ -167,18 +167,21 @@ class _Known(NamedTuple):
 class _Series:
     """Taylor coefficients of a linear operator and its residual at the particles of a cloud, as far as was asked."""
 
-    def __init__(self, traced: Traced, points: np.ndarray, params: Any):
-        self.traced, self.points, self.params = traced, points, params
+    def __init__(self, traced: Traced, points: np.ndarray):
+        self.traced, self.points = traced, points
         self.known = _Known(-1, np.zeros(len(points), bool))
 
-    def at(self, ids: np.ndarray, degree: int, ahead: int) -> tuple[Any, Any]:
-        """Those at particles, see ``Traced.coefficients``; ahead: degrees more that will be asked for soon."""
+    def at(self, ids: np.ndarray, degree: int, ahead: int, params: Any) -> tuple[Any, Any]:
+        """Those at particles, see ``Traced.coefficients``; ahead: degrees more that will be asked for soon.
+
+        params: with the numbers they had before; the arrays that held them then may hold others by now.
+        """
         known = self.known  # replaced as a whole: solves run in threads too
         if degree > known.degree:
             known = _Known(degree + ahead, np.zeros(len(self.points), bool))
         new = ids[~known.particles[ids]]
         if len(new):
-            jac, residual = self.traced.coefficients(self.points[new], known.degree, params=self.params)
+            jac, residual = self.traced.coefficients(self.points[new], known.degree, params=params)
             particles = known.particles.copy()
             particles[new] = True
             jac, residual = self._with(known.jac, jac, new), self._with(known.residual, residual, new)
@@ -211,10 +214,10 @@ def _series(disc: Discretization, problem: Problem, ids: np.ndarray) -> tuple[An
     size = len(cloud) * count(cloud.dim, degree) * int(traced.pattern.sum())
     if size > _LARGEST_SERIES or is_traced(cloud.points, jax.tree.leaves((traced, problem.params))):
         return traced.coefficients(picked(cloud.points, ids), degree, params=problem.params)
-    made = lambda: _Series(traced, np.asarray(cloud.points), problem.params)  # noqa: E731
+    made = lambda: _Series(traced, np.asarray(cloud.points))  # noqa: E731
     numbers = tuple(np.asarray(x).tobytes() for x in jax.tree.leaves(problem.params))
     ahead = 2 if kept(cloud, _EXPECTED, lambda: None) else 0
-    return kept(cloud, ("series", Same(traced), numbers), made).at(ids, degree, ahead)
+    return kept(cloud, ("series", Same(traced), numbers), made).at(ids, degree, ahead, problem.params)
 
 
 def operator_numbers(disc: Discretization, problem: Problem, ids: np.ndarray, taylor: Any) -> tuple[Any, Any]:
