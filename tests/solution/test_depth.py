@@ -189,6 +189,18 @@ def test_a_corner_that_all_but_meets_a_point_where_the_source_is_infinite(away, 
     assert error < 1e-3 and error / 3.0 < np.abs(sol.error_estimate()).max() < 10.0 * error and not sol.flags
 
 
+@pytest.mark.parametrize("away", [0.0, 1e-12, 1e-8])
+def test_beyond_a_root_there_is_no_number_and_no_pole(away):
+    """u = x^0.8 about a point a little beyond the end, behind which the source is no number: that was taken for the
+    pole, and 6e5 was estimated of an error of 7e-5."""
+    root = lambda x: (x[0] + away) ** 0.8
+    line = js.interval(0.0, 1.0, spacing=lambda x: np.minimum(0.05, 1e-4 + 0.3 * x[:, 0]))
+    held = {"left": js.dirichlet(root), "right": js.dirichlet(root)}
+    sol = js.solve(js.Problem(lambda u, x: js.laplacian(u)(x) + 0.16 * (x[0] + away) ** -1.2, held), line)
+    error = np.abs(sol.u - jax.vmap(root)(line.points)).max()
+    assert error < 2e-4 and error / 3.0 < np.abs(sol.error_estimate()).max() < 20.0 * error and not sol.flags
+
+
 def test_a_kink_outside_of_the_domain_changes_nothing():
     smooth, kinked = (lambda x: wave(x) + (x[0] + 1.0) ** 3 / 6.0), (lambda x: x[0] + 1.0)
     held = {s: js.dirichlet(smooth) for s in SIDES}

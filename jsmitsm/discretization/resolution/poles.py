@@ -224,13 +224,13 @@ def _approached(
     """
 
     def looked(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """|v| (...,) and the way to a pole of first order (..., D), none where v is infinite."""
+        """|v| (...,) and the way to a pole of first order (..., D), none where v is infinite; -1 where it is no number:
+        a root beyond its end, say, to which nobody goes."""
         with np.errstate(all="ignore"):
             value, *slope = np.asarray(valued(x.reshape(-1, x.shape[-1]), 1), float)
             way = value * np.array(slope) / np.square(slope).sum(axis=0)
-        infinite = ~np.isfinite(value)
-        size = np.where(infinite, np.inf, np.abs(value))
-        return size.reshape(x.shape[:-1]), np.where(infinite, 0.0, way).T.reshape(x.shape)
+        size = np.where(np.isnan(value), -1.0, np.abs(value))
+        return size.reshape(x.shape[:-1]), np.where(np.isfinite(value), way, 0.0).T.reshape(x.shape)
 
     at, moving = points.copy(), np.arange(len(points))
     size, way = looked(at)
