@@ -93,19 +93,18 @@ def _judged_numbers(disc: Discretization, problem: Problem, ids: np.ndarray, tay
     return jac, source, poles
 
 
-def judge_again(disc: Discretization, nums: Numbers, ids: np.ndarray) -> None:
-    """Replace the series of sources at particles whose supports have become wider by what reaches that far."""
+def judge_again(disc: Discretization, nums: Numbers) -> None:
+    """Replace the series of sources at particles, those of the classes, whose supports have become wider."""
     traced = disc.traced
     varies = disc.linear and traced.source == "variable" and np.shape(nums.source)[-1] > 1
-    if not varies or not len(ids) or nums.degenerate is not None or not (traced.kinked_source or traced.unbounded[0]):
+    if not varies or not disc.classes or nums.degenerate is not None:
         return
-    ids = np.intersect1d(ids, nums.ids)
-    some = [(cls, np.isin(cls.ids, ids)) for cls in disc.classes]
-    classes = [replace(cls, ids=cls.ids[at], neighbours=cls.neighbours[at]) for cls, at in some if at.any()]
-    _, source, poles = _judged_numbers(replace(disc, classes=classes), disc.problem, ids, None)
-    nums.source = np.array(nums.source)
-    nums.source[:, np.searchsorted(nums.ids, ids)] = source
-    nums.poles = joined(nums.poles, poles)
+    if traced.kinked_source or traced.unbounded[0]:
+        ids = np.sort(np.concatenate([cls.ids for cls in disc.classes]))
+        _, source, poles = _judged_numbers(disc, disc.problem, ids, None)
+        nums.source = np.array(nums.source)
+        nums.source[:, np.searchsorted(nums.ids, ids)] = source
+        nums.poles = joined(nums.poles, poles)
 
 
 def _softened(disc: Discretization, problem: Problem, ids: np.ndarray, source: Any) -> Any:

@@ -106,7 +106,8 @@ def repaired(
                 new_rows.append(row)
                 touched.append(changed)
     changed = np.concatenate(touched)
-    judge_again(replace(disc, classes=new_classes), nums, changed)
+    wider = [_some(cls, at) for cls in new_classes if (at := np.isin(cls.ids, changed)).any()]
+    judge_again(replace(disc, classes=wider), nums)
     return new_classes, new_rows, replace(examine(new_classes, new_rows), repaired=changed)
 
 
