@@ -62,13 +62,13 @@ class Marks(NamedTuple):
 
 def marks(
     points: np.ndarray, spacing: np.ndarray, contribution: np.ndarray, power: float, before: Marks | None,
-    edge: np.ndarray | None = None, expected: float | None = None,
+    edge: np.ndarray | None = None, expected: float | None = None, poles: np.ndarray | None = None,
 ) -> Marks:  # fmt: skip
     """Contributions smoothed, and the rates at which they fall with the spacing.
 
     power: that of a smooth solution. before: those of the round before, None where it had another order or was not
     trustworthy; then all fall at the rate ``expected``, that of a smooth solution if None. edge (N,): where smoothness
-    ends, rather than beside.
+    ends, rather than beside. poles (P, D): where it is known to end, between the particles.
     """
     away, near = cKDTree(points).query(points, k=range(1, min(_WORST, len(points)) + 1))
     largest = contribution[near[:, :_NEAR]].max(axis=1)
@@ -95,7 +95,11 @@ def marks(
         at = _middle(contribution[near], away / spacing[:, None], near, edge)[stark]
         at = at[edge[at]]
         rate[at] = _SUSPECTED
-    singular, located = _singular(points, spacing, np.unique(at), before)
+    sure = np.zeros(0, int)
+    if poles is not None and len(poles):
+        sure = _lone(points, spacing, np.unique(cKDTree(points).query(poles)[1]))
+    rate[sure] = np.minimum(rate[sure], _SUSPECTED)
+    singular, located = _singular(points, spacing, np.unique(at), before, sure)
     return Marks(points, spacing, largest, np.clip(rate, _SLOWEST, power), singular, located)
 
 
@@ -124,14 +128,16 @@ def _where_known(points: np.ndarray, spacing: np.ndarray, at: np.ndarray, before
 
 
 def _singular(
-    points: np.ndarray, spacing: np.ndarray, at: np.ndarray, before: Marks | None
+    points: np.ndarray, spacing: np.ndarray, at: np.ndarray, before: Marks | None, sure: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Where smoothness ends (N,), of the particles ``at``, and where that was found at the same point twice (N,)."""
+    """Where smoothness ends (N,), of the particles ``at`` or ``sure``ly, and where that is surely so, or was found at
+    the same point twice (N,)."""
     singular, located = np.zeros((2, len(points)), bool)
     singular[at] = True
     if before is not None and before.singular.any() and singular.any():
         located[at] = cKDTree(before.points[before.singular]).query(points[at])[0] <= _SAME * spacing[at]
-        singular &= located | ~_reached(points, spacing, located, _AFFECTED)
+    singular[sure] = located[sure] = True
+    singular &= located | ~_reached(points, spacing, located, _AFFECTED)
     return singular, located
 
 
@@ -143,23 +149,23 @@ def _reached(points: np.ndarray, spacing: np.ndarray, some: np.ndarray, reach: f
     return ~some & (away < reach * spacing[some][near])
 
 
-def _alone(found: Marks) -> np.ndarray:
-    """The singular points (N,) that are no part of a line of them."""
-    at = np.flatnonzero(found.singular)
-    alone = np.zeros(len(found.points), bool)
-    if len(at):
-        tree = cKDTree(found.points[at])
-        alone[at] = tree.query_ball_point(tree.data, _ALONG * found.spacing[at], return_length=True) < _FEW
-    return alone
+def _lone(points: np.ndarray, spacing: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Those of the particles ``at`` that are no part of a line of them."""
+    if not len(at):
+        return at
+    tree = cKDTree(points[at])
+    return at[tree.query_ball_point(tree.data, _ALONG * spacing[at], return_length=True) < _FEW]
 
 
 def next_spacing(
-    found: Marks, power: float, error: float, wanted: float, most: float, gathered: Gathered | None = None
+    found: Marks, power: float, error: float, wanted: float, most: float, gathered: Gathered | None = None,
+    missed: np.ndarray | float = 0.0,
 ) -> tuple[np.ndarray, float]:
     """Spacings (N,) at the particles for an error ``wanted`` where it is ``error`` now, and how many that makes.
 
     most: particles that may be, about; where more were needed, the contributions are equal and larger. gathered: the
-    error that contributions (N,) make together; a guess where None.
+    error that contributions (N,) make together; a guess where None. missed (N,): the part of the error that falls with
+    the spacing at a point where smoothness is known to end, whatever else contributes.
     """
     eta = np.maximum(found.contribution, 1e-300)
     dim = found.points.shape[1]
@@ -169,13 +175,15 @@ def next_spacing(
     aim = SAFETY * wanted / max(error, 1e-300) * max(float(eta.max()), now)
     rate = np.where(found.singular, found.rate, np.maximum(found.rate, _ROUGH * power))
     lowest = np.where(found.located, LOCATED, np.where(found.singular, SINGULAR, FINER))
-    alone = found.located | _alone(found)
+    alone = found.located.copy()
+    alone[_lone(found.points, found.spacing, np.flatnonzero(found.singular))] = True
     shaded = _reached(found.points, found.spacing, alone, _REACH)
+    own = np.where(found.located, SAFETY * wanted / np.maximum(missed, 1e-300), np.inf)
     goal, count = aim, float(len(eta))
     coarser = COARSER if error > ROUGH else GENTLY if error > FAR * wanted else 1.0
     for _ in range(200):
         highest = np.where(eta < _NOTHING * goal, COARSER, coarser)
-        less = np.where(alone, max(goal, _POINT * aim), goal) / eta
+        less = np.minimum(np.where(alone, max(goal, _POINT * aim), goal) / eta, own)
         factor = np.clip(less ** (1.0 / np.where(less < 1, rate, power)), lowest, highest)
         if factor[alone].min(initial=1.0) < FINER:
             factor = np.where(shaded, np.maximum(factor, 1.0), factor)  # the gradation refines these

@@ -16,6 +16,7 @@ from jsmitsm.adaptation.layers import layers
 from jsmitsm.adaptation.marking import FAR, ROUGH, SLOW, Marks, marks, next_spacing
 from jsmitsm.adaptation.measure import Measured, Quantity, gaps, measured, size, spent
 from jsmitsm.adaptation.spacing_field import SpacingField
+from jsmitsm.adaptation.witness import Earlier, doubted, remembered, unseen
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.equation.problem import Problem
 from jsmitsm.runtime.errors import SolveError
@@ -37,14 +38,8 @@ _GAP = 10.0
 # Where the values may be off by more than they are thought to be, they are off by so many times as much, no more: a
 # corner of hardly more than 180 degrees, at which no estimate sees anything, against a layer at a wall.
 _PARTLY = 2.0
-# Where smoothness ends solutions of two orders miss the same, and are nearer to each other than to what is true: the
-# distance is taken for this part of the error.
-_ALIKE = 0.5
 # Near the end of a search one aims at this part of the tolerance, if there are such points.
 _AIMED = 0.6
-# What is missed of a source between the particles is that as well, where contributions fall with less than this power:
-# there no mean over a few points tells what its infinite values make.
-_INFINITE = 1.0
 # The numbers of two rounds may differ by so many times what the first was thought to be off by.
 _AGREE = 3.0
 # Where they part, at a corner most often, that falls with this power of the spacing.
@@ -99,6 +94,7 @@ class Rounds:
         self.data: Data | None = None
         self.least, self.highest, self.shallow = 1, ORDERS[-1], False
         self.before: Marks | None = None
+        self.earlier: Earlier | None = None
         self.best: tuple[int, float, SpacingField] | None = None  # order, error and spacing of the best round so far
         self.apart: np.ndarray | None = None  # gaps between neighbours, where they are what is wrong
         self.least_error: Ended | None = None
@@ -179,6 +175,7 @@ class Rounds:
         now = time.perf_counter()
         self.rows.append((len(cloud), order, found.error, now - self.clock, float(h.min())))
         self.clock = now
+        self.earlier = None if self.solution is None else remembered(self.solution)
         self.spacing, self.solution = spacing, sol
         self.error = self.undoubted = found.error
         self.number_before, self.number = self.number, found.number
@@ -288,9 +285,8 @@ class Rounds:
         """The error where smoothness ends, of which the estimate sees a part."""
         if found.local is None or self.before is None:
             return 0.0
-        infinite = (rate < _INFINITE) & (self.data is not None and self.data.traced.unbounded[0])
-        seen = np.where(infinite, np.maximum(found.local, found.missed), found.local)
-        return float(seen[rate < SLOW].max(initial=0.0)) / _ALIKE
+        unbounded = self.data is not None and self.data.traced.unbounded[0]
+        return doubted(found, rate, unbounded, lambda: unseen(self.solution, self.rows, self.earlier))
 
     def _disagreed(self) -> float:
         """By how much the number changed unforeseen: what makes it of the values, a quadrature say, errs too."""
@@ -341,7 +337,7 @@ class Rounds:
         wanted = _EASED * self.tol if apart is not None else self.tol if self.error > self.tol else 0.5 * error
         if here.singular.any() and error <= FAR * self.tol:  # the estimate will be doubted there, soon
             wanted *= _AIMED
-        made_h, _ = next_spacing(here, power, error, wanted, most, found.gathered)
+        made_h, _ = next_spacing(here, power, error, wanted, most, found.gathered, found.missed)
         if apart is not None:
             parted = marks(points, h, apart, power, None, expected=_PARTED)
             torn = apart > _TORN * _GAP * self.tol * found.scale
@@ -384,7 +380,8 @@ class Rounds:
         # Contributions at another order are others, in a constant at least: they tell no rate.
         comparable = len(self.rows) > 1 and self.rows[-1][1] == self.rows[-2][1] and np.isfinite(found.error)
         points, before = np.asarray(cloud.points), self.before if comparable else None
-        return marks(points, spacing(points), found.contribution, self._power(cloud), before, edges(cloud))
+        known = self.solution.poles
+        return marks(points, spacing(points), found.contribution, self._power(cloud), before, edges(cloud), poles=known)
 
     def _better(self, spacing: SpacingField) -> SpacingField | None:
         """The spacing of a round before that did better than the last one, over which no other may grow then."""

@@ -195,6 +195,15 @@ class Solution(Anywhere):
         return np.asarray(self._fit.neighbours)
 
     @property
+    def poles(self) -> np.ndarray:
+        """Where (P, D) the source or a potential was found to be infinite between the particles, beside each of them.
+
+        Sought for linear problems by method S, in the series that end within a stencil; see ``flags``.
+        """
+        found = getattr(getattr(self._report, "nums", None), "poles", None)
+        return np.zeros((0, self.cloud.dim)) if found is None else found.at
+
+    @property
     def defects(self) -> bool:
         """Whether the estimate knows defects, and ``correction`` more than the size of the error."""
         return not hasattr(self._fit, "error_estimate")
