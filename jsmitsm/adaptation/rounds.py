@@ -16,7 +16,7 @@ from jsmitsm.adaptation.layers import layers
 from jsmitsm.adaptation.marking import FAR, ROUGH, SLOW, Marks, marks, next_spacing
 from jsmitsm.adaptation.measure import Measured, Quantity, gaps, measured, size, spent
 from jsmitsm.adaptation.spacing_field import SpacingField
-from jsmitsm.adaptation.witness import Earlier, doubted, remembered, unseen
+from jsmitsm.adaptation.witness import Earlier, doubted, remembered, stands_out, unseen
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.equation.problem import Problem
 from jsmitsm.runtime.errors import SolveError
@@ -267,6 +267,8 @@ class Rounds:
                 self.apart = apart
             else:  # where smoothness ends the values are off by as much, elsewhere by some of it
                 some = min(_PARTLY * self.error, float(between.max()))
+                if self.before is None:
+                    some = max(some, stands_out(np.asarray(cloud.points), spacing(np.asarray(cloud.points)), between))
                 self.error = max(self.error, float(between[rate < SLOW].max(initial=some)))
         self.undoubted = max(self.error, self._disagreed())
         self.error = max(self.undoubted, self._doubted(found, rate))

@@ -21,6 +21,8 @@ ALIKE = 0.5
 _INFINITE = 1.0
 # Two rounds know better where the estimate has fallen to this part: what the last one is off by then hardly counts.
 _FALLEN = 1.0 / 3.0
+# The gap of a point counts as one of its own where all between so many spacings from it are so many times smaller.
+_RING, _ALONE = (2.5, 6.0), 4.0
 
 
 class Earlier(NamedTuple):
@@ -46,6 +48,17 @@ def doubted(found: Measured, rate: np.ndarray, unbounded: bool, times: Callable[
     infinite = unbounded & (rate < _INFINITE)
     seen = np.where(infinite, np.maximum(found.local, found.missed), found.local)[rate < SLOW].max(initial=0.0)
     return float(seen) * times() if seen else 0.0
+
+
+def stands_out(points: np.ndarray, spacing: np.ndarray, apart: np.ndarray) -> float:
+    """The largest of the gaps (N,) between neighbours if nothing around it is like it, else 0.
+
+    Smoothness ends at a point then, a corner most often, before two rounds tell; a layer is like itself all along.
+    """
+    worst = int(apart.argmax())
+    away = np.linalg.norm(points - points[worst], axis=1) / spacing[worst]
+    around = (away > _RING[0]) & (away < _RING[1])
+    return float(apart[worst]) if apart[worst] > _ALONE * apart[around].max(initial=0.0) else 0.0
 
 
 def unseen(sol: Solution, rows: list[Row], earlier: Earlier | None) -> float:
