@@ -11,6 +11,7 @@ from jsmitsm.adaptation.growth import Row
 from jsmitsm.adaptation.marking import SLOW
 from jsmitsm.adaptation.measure import Measured
 from jsmitsm.cloud.cloud import INTERIOR
+from jsmitsm.runtime.errors import SolveError
 from jsmitsm.solution.solution import Solution
 
 # Where smoothness ends solutions of two orders miss the same, and are nearer to each other than to what is true: the
@@ -71,6 +72,9 @@ def unseen(sol: Solution, rows: list[Row], earlier: Earlier | None) -> float:
     thought, left = rows[-2][2], rows[-1][2]
     if not (np.isfinite(thought) and left <= _FALLEN * thought):
         return 1.0 / ALIKE
-    now = np.asarray(sol(earlier.points, outside="extrapolate")).reshape(earlier.values.shape)
+    try:
+        now = np.asarray(sol(earlier.points, outside="extrapolate")).reshape(earlier.values.shape)
+    except (ValueError, SolveError):
+        return 1.0 / ALIKE  # a source that is infinite on the boundary
     off = float(np.abs(now - earlier.values).max() / np.abs(np.asarray(sol.u)).max())
     return float(np.clip(off / (thought - left), 1.0, 1.0 / ALIKE))
