@@ -26,13 +26,13 @@ from jsmitsm.taylor.multi_indices import multi_indices
 __version__ = "0.2.0"
 
 __all__ = [
-    "Adapted", "Cloud", "Condition", "Constant", "CubicSpline", "Evolution", "Factorization", "Formulation",
-    "Gaussian", "Kernel", "Method", "Modes", "Problem", "Quality", "Solution", "SolveError", "Solver", "Stencils",
-    "SuperGaussian", "TuneResult", "Wendland", "adapt", "box", "condition", "constraint", "continuation",
-    "dirichlet", "divergence", "dt", "eigen", "evolve", "factorize", "files", "fix", "free", "from_polygon",
-    "from_sdf", "grad", "hessian", "interface", "interval", "laplacian", "meant", "multi_indices", "neumann",
-    "no_progress", "node_weights", "partial", "periodic", "plot", "point_source", "quadrature", "quality",
-    "rectangle", "regions", "robin", "sdf", "show_versions", "solve", "stencils", "tune",
+    "Adapted", "AdaptedEvolution", "Cloud", "Condition", "Constant", "CubicSpline", "Evolution", "Factorization",
+    "Formulation", "Gaussian", "Kernel", "Method", "Modes", "Problem", "Quality", "Readapt", "Solution",
+    "SolveError", "Solver", "Stencils", "SuperGaussian", "TuneResult", "Wendland", "adapt", "box", "condition",
+    "constraint", "continuation", "dirichlet", "divergence", "dt", "eigen", "evolve", "factorize", "files", "fix",
+    "free", "from_polygon", "from_sdf", "grad", "hessian", "interface", "interval", "laplacian", "meant",
+    "multi_indices", "neumann", "no_progress", "node_weights", "partial", "periodic", "plot", "point_source",
+    "quadrature", "quality", "rectangle", "regions", "robin", "sdf", "show_versions", "solve", "stencils", "tune",
 ]  # fmt: skip
 
 # Imported when first used, the solver too: who draws or makes clouds need not wait for it. Where each stands is said
@@ -45,6 +45,8 @@ if TYPE_CHECKING:
     from jsmitsm.cloud.regions.making import regions
     from jsmitsm.cloud.regions.node_weights import node_weights
     from jsmitsm.cloud.shapes import from_polygon, from_sdf
+    from jsmitsm.evolution.adaptive.adapted import AdaptedEvolution
+    from jsmitsm.evolution.adaptive.readapt import Readapt
     from jsmitsm.evolution.evolution import Evolution
     from jsmitsm.evolution.evolve import evolve
     from jsmitsm.linear.linsolve import Solver
@@ -61,12 +63,14 @@ if TYPE_CHECKING:
 else:
     _LAZY = {
         "Adapted": "adaptation.adapt",
+        "AdaptedEvolution": "evolution.adaptive.adapted",
         "Evolution": "evolution.evolution",
         "Factorization": "solution.factorization",
         "Formulation": "solution.arguments",
         "Method": "solution.arguments",
         "Modes": "modes.modes",
         "Quality": "cloud.quality",
+        "Readapt": "evolution.adaptive.readapt",
         "Solution": "solution.solution",
         "Solver": "linear.linsolve",
         "TuneResult": "tuning.tune",

@@ -19,7 +19,9 @@ MAY_IMPORT = {
     "discretization": ("runtime", "taylor", "particle", "cloud", "equation"),
     "solution": ("runtime", "taylor", "particle", "cloud", "equation", "linear", "discretization"),
     "adaptation": ("runtime", "taylor", "particle", "cloud", "equation", "linear", "discretization", "solution"),
-    "evolution": ("runtime", "taylor", "particle", "cloud", "equation", "linear", "discretization", "solution"),
+    "evolution": (
+        "runtime", "taylor", "particle", "cloud", "equation", "linear", "discretization", "solution", "adaptation",
+    ),  # fmt: skip
     "modes": ("runtime", "taylor", "particle", "cloud", "equation", "linear", "discretization", "solution"),
     "tuning": ("runtime", "taylor", "particle", "cloud", "equation", "linear", "discretization", "solution"),
     "show": ("runtime", "taylor", "particle", "cloud", "equation", "linear", "discretization", "solution"),

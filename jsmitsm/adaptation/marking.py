@@ -159,13 +159,14 @@ def _lone(points: np.ndarray, spacing: np.ndarray, at: np.ndarray) -> np.ndarray
 
 def next_spacing(
     found: Marks, power: float, error: float, wanted: float, most: float, gathered: Gathered | None = None,
-    missed: np.ndarray | float = 0.0,
+    missed: np.ndarray | float = 0.0, coarser: float | None = None,
 ) -> tuple[np.ndarray, float]:
     """Spacings (N,) at the particles for an error ``wanted`` where it is ``error`` now, and how many that makes.
 
     most: particles that may be, about; where more were needed, the contributions are equal and larger. gathered: the
     error that contributions (N,) make together; a guess where None. missed (N,): the part of the error that falls with
-    the spacing at a point where smoothness is known to end, whatever else contributes.
+    the spacing at a point where smoothness is known to end, whatever else contributes. coarser: by how much a spacing
+    may grow at most; the error and the contributions decide where None.
     """
     eta = np.maximum(found.contribution, 1e-300)
     dim = found.points.shape[1]
@@ -180,9 +181,11 @@ def next_spacing(
     shaded = _reached(found.points, found.spacing, alone, _REACH)
     own = np.where(found.located, SAFETY * wanted / np.maximum(missed, 1e-300), np.inf)
     goal, count = aim, float(len(eta))
-    coarser = COARSER if error > ROUGH else GENTLY if error > FAR * wanted else 1.0
+    nothing = COARSER if coarser is None else coarser
+    if coarser is None:
+        coarser = COARSER if error > ROUGH else GENTLY if error > FAR * wanted else 1.0
     for _ in range(200):
-        highest = np.where(eta < _NOTHING * goal, COARSER, coarser)
+        highest = np.where(eta < _NOTHING * goal, nothing, coarser)
         less = np.minimum(np.where(alone, max(goal, _POINT * aim), goal) / eta, own)
         factor = np.clip(less ** (1.0 / np.where(less < 1, rate, power)), lowest, highest)
         if factor[alone].min(initial=1.0) < FINER:

@@ -337,7 +337,7 @@ class Rounds:
             return None
         most = growth.most(len(cloud), cloud.dim, self.max_particles)
         wanted = _EASED * self.tol if apart is not None else self.tol if self.error > self.tol else 0.5 * error
-        if here.singular.any() and error <= FAR * self.tol:  # the estimate will be doubted there, soon
+        if here.singular.any() and error <= _AIMED * FAR * self.tol:  # the estimate will be doubted there, soon
             wanted *= _AIMED
         made_h, _ = next_spacing(here, power, error, wanted, most, found.gathered, found.missed)
         if apart is not None:

@@ -12,31 +12,39 @@ from jsmitsm.evolution.steps import dense_output
 from jsmitsm.runtime.progress import PENCIL, bar
 from jsmitsm.taylor.multi_indices import HIGHEST
 
-# So many times are looked at.
-LOOKS = 10
+# So many times are looked at; of waves, which an error accompanies, each that the steps know up to so many.
+LOOKS, OF_WAVES = 10, 400
 
 
 @bar("error estimate", parts=(*PENCIL, ("times", 4.0)))
-def estimated(
-    run: Run, times: np.ndarray, history: tuple[np.ndarray, np.ndarray], rates: np.ndarray | None, in_time: np.ndarray
-) -> np.ndarray:
-    """Estimated errors (S, N, F): |w - u| of A' w = B' f + Bg' g, f = -(M u' + N), and in_time (S,), what steps add.
+def in_space(
+    run: Run, history: tuple[np.ndarray, np.ndarray], rates: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Times (K + 1,), and estimated errors w - u (K + 1, N, F) at them: A' w = B' f + Bg' g, f = -(M u' + N).
 
     Dashes are of order p + 2. What the rates leave over drives the error, from zero at the start. history: times and
-    values of the steps; rates: theirs, of second order in time.
+    values of the steps; rates: theirs, of second order in time. Zero where nothing is known: quasilinear problems.
     """
     semi, (steps, values) = run.semi, history
-    out = np.zeros((len(times), semi.n, semi.fields))
-    if len(steps) > 1 and not run.timed.quasilinear and run.order + 2 <= HIGHEST:
-        grid = np.linspace(steps[0], steps[-1], min(LOOKS, len(steps) - 1) + 1)
-        # Pairs of fields that drive one another are the ones that are damped.
-        integrated = _summed if run.damping and not semi.second else _integrated
-        errors = np.abs(integrated(semi, run.finer(), steps, values, rates, grid))
-        index = np.clip(np.searchsorted(grid, times), 1, len(grid) - 1)
-        part = ((times - grid[index - 1]) / (grid[index] - grid[index - 1]))[:, None, None]
-        out = (1.0 - part) * errors[index - 1] + part * errors[index]
-    out += in_time[:, None, None]
-    out.reshape(len(times), -1)[1:, semi.held] = 0.0
+    if len(steps) < 2 or run.timed.quasilinear or run.order + 2 > HIGHEST:
+        return steps[[0, -1]], np.zeros((2, semi.n, semi.fields))
+    grid = np.linspace(steps[0], steps[-1], min(OF_WAVES if semi.second else LOOKS, len(steps) - 1) + 1)
+    # Pairs of fields that drive one another are the ones that are damped.
+    integrated = _travelled if semi.second else _summed if run.damping else _integrated
+    errors = integrated(semi, run.finer(), steps, values, rates, grid)
+    errors.reshape(len(grid), -1)[:, semi.held] = 0.0
+    return grid, errors
+
+
+def estimated(
+    run: Run, times: np.ndarray, grid: np.ndarray, errors: np.ndarray, in_time: np.ndarray
+) -> np.ndarray:
+    """The sizes of errors (S, N, F) at the times: of those in space at a grid, and in_time (S,), what steps add."""
+    errors = np.abs(errors)
+    index = np.clip(np.searchsorted(grid, times), 1, len(grid) - 1)
+    part = ((times - grid[index - 1]) / np.maximum(grid[index] - grid[index - 1], 1e-300))[:, None, None]
+    out = (1.0 - part) * errors[index - 1] + part * errors[index] + in_time[:, None, None]
+    out.reshape(len(times), -1)[1:, run.semi.held] = 0.0
     return out
 
 
@@ -52,6 +60,23 @@ def _integrated(
             misfit = high.system.force(_misfit(semi, high, steps, values, rates, float(t)))
             y = resolvent.solve(high.system.mass(y) + h * misfit)
             out.append(high.placed(y[: high.system.n], np.zeros(len(high.held))))
+            shown.update(1)
+    return np.stack(out)
+
+
+def _travelled(
+    semi: Semidiscrete, high: Semidiscrete, steps: Any, values: Any, rates: Any, grid: np.ndarray
+) -> np.ndarray:
+    """The same of second order in time, by the midpoint rule: nothing dies out, and what is left over travels with the
+    error that it makes, which grows all the way."""
+    h = float(grid[1] - grid[0])
+    resolvent, nothing = high.system.resolvent(0.5 * h), np.zeros(len(high.held))
+    y, out = np.zeros(high.system.size), [np.zeros((semi.n, semi.fields))]
+    with bar("times", len(grid) - 1) as shown:
+        for t in 0.5 * (grid[1:] + grid[:-1]):
+            misfit = high.system.force(_misfit(semi, high, steps, values, rates, float(t)))
+            y = 2.0 * resolvent.solve(high.system.mass(y) + 0.5 * h * misfit) - y
+            out.append(high.placed(y[: high.system.n], nothing))
             shown.update(1)
     return np.stack(out)
 

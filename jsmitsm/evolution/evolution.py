@@ -293,10 +293,13 @@ class Evolution(Copied):
 
 
 class Report:
-    """What a run can still say of itself when asked: its flags, and an estimate of its error."""
+    """What a run can still say of itself when asked: its flags, and an estimate of its error.
 
-    def __init__(self, flags: list[str], told: list[str], estimate: Callable[[], Any]):
-        self.flags, self.told = flags, told
+    in_space: makes the error (N, F) in space at the end, u_exact - u with its sign.
+    """
+
+    def __init__(self, flags: list[str], told: list[str], estimate: Callable[[], Any], in_space: Callable[[], Any]):
+        self.flags, self.told, self.in_space = flags, told, in_space
         self._estimate, self._found = estimate, None
 
     def estimate(self) -> Any:

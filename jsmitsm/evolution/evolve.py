@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import time
-from typing import Any, Literal
+from typing import Any, Literal, TypeAlias, overload
 
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.cloud.neighbours import Stencils
 from jsmitsm.equation.problem import Problem
+from jsmitsm.evolution.adaptive.adapted import AdaptedEvolution
+from jsmitsm.evolution.adaptive.parts import followed, refuse_what_does_not_damp
+from jsmitsm.evolution.adaptive.readapt import Readapt
 from jsmitsm.evolution.arguments import Scheme, check, saved_times, starting_values
 from jsmitsm.evolution.evolution import Evolution
 from jsmitsm.evolution.gradient.differentiable import differentiable
@@ -17,17 +20,33 @@ from jsmitsm.evolution.regions.timed import regions_timed
 from jsmitsm.evolution.run import Run
 from jsmitsm.evolution.space.timed import timed
 from jsmitsm.runtime.arrays import ValueOrFunction
-from jsmitsm.runtime.errors import explaining
+from jsmitsm.runtime.errors import explaining, short
 from jsmitsm.runtime.progress import PENCIL, bar
 from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.solution.arguments import Depth, of_regions
 
+Start: TypeAlias = ValueOrFunction | tuple[ValueOrFunction, ValueOrFunction]
 
+
+@overload
+def evolve(
+    problem: Problem, cloud: Cloud, u0: Start, t: tuple[float, float], *, steps: int | None = None,
+    tol: float | None = None, order: int = 4, scheme: Scheme = "auto", save: int | Any = None,
+    damping: float | Literal["auto"] = "auto", stencils: Stencils | None = None, depth: Depth = "auto",
+    throw: bool = True, progress: bool = True, readapt: None = None,
+) -> Evolution: ...  # fmt: skip
+@overload
+def evolve(
+    problem: Problem, cloud: Cloud, u0: Start, t: tuple[float, float], *, steps: int | None = None,
+    tol: float | None = None, order: int = 4, scheme: Scheme = "auto", save: int | Any = None,
+    damping: float | Literal["auto"] = "auto", stencils: Stencils | None = None, depth: Depth = "auto",
+    throw: bool = True, progress: bool = True, readapt: Readapt,
+) -> AdaptedEvolution: ...  # fmt: skip
 @explaining
 def evolve(
     problem: Problem,
     cloud: Cloud,
-    u0: ValueOrFunction | tuple[ValueOrFunction, ValueOrFunction],
+    u0: Start,
     t: tuple[float, float],
     *,
     steps: int | None = None,
@@ -40,7 +59,8 @@ def evolve(
     depth: Depth = "auto",
     throw: bool = True,
     progress: bool = True,
-) -> Evolution:
+    readapt: Readapt | None = None,
+) -> Evolution | AdaptedEvolution:
     """Evolve ``problem`` on ``cloud`` from ``u0`` over the times ``t``.
 
     The functions of the problem take the time: ``pde(u, x, t)``, in which ``js.dt(u)(x)`` and ``js.dt(u, 2)(x)`` are
@@ -87,17 +107,22 @@ def evolve(
         False.
     progress : bool
         A bar with the time and an estimate of the rest.
+    readapt : Readapt, optional
+        Make the cloud anew on the way, where the error is: ``js.Readapt(make, tol)``. ``cloud`` is what it begins with,
+        made finer where the function u0 asks for it; ``steps`` are spread over the parts, rounded up.
 
     Returns
     -------
     Evolution
-        The states at the saved times, and at any other by ``.at(t)``.
+        The states at the saved times, and at any other by ``.at(t)``; with ``readapt`` an ``AdaptedEvolution``, whose
+        states lie on several clouds.
 
     Raises
     ------
     ValueError
         For bad input, and for problems that this cannot do: pure advection, conditions nonlinear in u; with several
-        regions, nonlinear equations and second order in time.
+        regions, nonlinear equations and second order in time; with ``readapt`` nonlinear highest derivatives, second
+        order in time, incompressible flows, several regions, a user's stencils, and whatever is traced by JAX.
     SolveError
         For a run that blew up, a stage that did not converge, steps that became too small.
 
@@ -134,6 +159,8 @@ def evolve(
     began = time.perf_counter()
     check(problem, cloud, t, steps, tol, order, scheme, throw, progress)
     several = of_regions(problem, cloud)
+    if readapt is not None:
+        _refuse_readapt(readapt, several, stencils, is_traced(problem, cloud, u0, t))
     made: Any = regions_timed(problem, cloud) if several else timed(problem, cloud)  # type: ignore[arg-type]
     second = bool(made.masses[1].slots)
     start = starting_values(u0, cloud, problem.fields, second)
@@ -147,6 +174,11 @@ def evolve(
         parts = saved_times(save, 0.0, 1.0)
     else:
         parts = saved_times(save, float(t[0]), float(t[1]))
+    if readapt is not None:
+        refuse_what_does_not_damp(made)
+        span = float(t[0]), float(t[1])
+        with bar("evolve", wanted=progress, parts=(("parts", 1.0),)):
+            return followed(problem, cloud, u0, span, steps, tol, parts, readapt, options)
     # Measured with 1,000 and 8,000 particles: a step takes about as long as one of the fits; with tol some forty do.
     with bar("evolve", wanted=progress, parts=(*PENCIL, ("steps", float(40 if steps is None else steps)))):
         run = (RegionsRun if several else Run)(made, cloud, start, t, began, **options)
@@ -160,3 +192,16 @@ def evolve(
             return march(run, None if steps is None else int(steps), None if tol is None else float(tol), parts, shown)
 
 
+
+
+def _refuse_readapt(readapt: Any, several: bool, stencils: Any, traced: bool) -> None:
+    if not isinstance(readapt, Readapt):
+        raise ValueError(f"readapt: expected js.Readapt(make, tol), got {short(readapt)}")
+    if several:
+        raise ValueError("readapt: clouds of several regions are not made anew on the way; leave it out")
+    if stencils is not None:
+        raise ValueError("stencils: belong to one cloud, and readapt makes others; leave one of them out")
+    if traced:
+        raise ValueError(
+            "readapt: no cloud can be made from traced values; differentiate js.evolve on one cloud, without readapt"
+        )

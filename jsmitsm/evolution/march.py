@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import time
+from functools import cache
 from typing import Any
 
 import numpy as np
 
-from jsmitsm.evolution.estimate import estimated
+from jsmitsm.evolution.estimate import estimated, in_space
 from jsmitsm.evolution.evolution import Evolution, Report
 from jsmitsm.evolution.run import Run
 from jsmitsm.evolution.steps import dense_output
@@ -231,14 +232,16 @@ def _finished(run: Run, parts: np.ndarray, history: History, fault: str, began: 
     kept = np.array(history.times), np.stack(history.states)
     moved = np.stack(history.rates) if history.rates else None
 
+    known = cache(lambda: in_space(run, kept, moved))
+
     def estimate() -> np.ndarray:
-        found = estimated(run, np.asarray(times), kept, moved, later)
+        found = estimated(run, np.asarray(times), *known(), later)
         part = float(found.max(initial=0.0)) / (history.scale or 1.0)
         if part > LARGE and not (in_time is not None and in_time > LARGE):
             flags.append(f"The estimated error is {part:.0%} of the solution: refine the cloud, or raise the order.")
         return found
 
-    report = Report(flags, told, estimate)
+    report = Report(flags, told, estimate, lambda: known()[1][-1])
     return Evolution(times, states, rates, run.cloud, recipe, not fault, stats, kept, report, fit)
 
 
