@@ -9,6 +9,7 @@ import pytest
 
 import jsmitsm as js
 from benchmarks.adaptation import CASES
+from benchmarks.nist import reentrant
 from jsmitsm.adaptation.data import data_of, unresolved
 from jsmitsm.adaptation.edges import edges
 from jsmitsm.adaptation.first_cloud import first_cloud
@@ -18,6 +19,7 @@ from jsmitsm.adaptation.marking import Marks, marks, next_spacing
 from jsmitsm.adaptation.measure import Measured
 from jsmitsm.adaptation.rounds import Rounds
 from jsmitsm.adaptation.spacing_field import GROWTH, SpacingField
+from jsmitsm.adaptation.witness import Earlier, remembered, stands_out, unseen
 
 CORNER = [(0, 0), (1, 0), (1, 1), (-1, 1), (-1, -1), (0, -1)]
 SQUARE = [(0, 0), (1, 0), (1, 1), (0, 1)]
@@ -272,6 +274,50 @@ def test_a_corner_that_nobody_sees_is_in_the_error():
     case = CASES["corner-180"]()
     found = js.adapt(case.problem, case.make, 1e-3, progress=False)
     assert found.reached and 1 / 3 < found.error / true_error(found, case.exact) < 5
+
+
+@pytest.mark.parametrize("degrees", [188, 200, 215])
+def test_a_weak_corner_stands_out_in_the_first_round(degrees):
+    """The estimate of one round sees a tenth of it, what parts the corner's neighbours all of it."""
+    case = reentrant(np.deg2rad(degrees), "weak")
+    found = js.adapt(case.problem, case.make, 1e-2, progress=False)
+    assert found.reached and len(found.history["particles"]) == 1
+    assert 1 / 3 < found.error / true_error(found, case.exact) < 5
+
+
+def test_a_gap_along_a_wall_does_not_stand_out():
+    x, y = (a.ravel() for a in np.meshgrid(np.linspace(0, 1, 21), np.linspace(0, 1, 21)))
+    points, h = np.stack([x, y], axis=1), np.full(441, 0.05)
+    assert stands_out(points, h, np.exp(-20 * x)) == 0.0
+    assert stands_out(points, h, np.exp(-20 * np.hypot(x, y))) == 1.0
+
+
+def test_a_pole_that_the_solve_found_is_refined_at_once():
+    """A cone: its source 1 / r is infinite between the particles, and nothing else is to be resolved."""
+    cone = lambda x: jnp.sqrt((x[0] - 0.43) ** 2 + (x[1] - 0.52) ** 2)  # noqa: E731
+    problem = js.Problem(lambda u, x: js.laplacian(u)(x) - 1.0 / cone(x), {"boundary": js.dirichlet(cone)})
+    make = lambda spacing: js.from_polygon(SQUARE, spacing)  # noqa: E731
+    first = js.solve(problem, make(0.08), order=4)
+    assert len(first.poles) and np.abs(first.poles - [0.43, 0.52]).max() < 1e-6
+    assert js.solve(GOOD, line(0.1)).poles.shape == (0, 1)
+    found = js.adapt(problem, make, 1e-4, progress=False)
+    assert found.reached and len(found.history["particles"]) <= 3
+    assert found.history["smallest"][1] < found.history["smallest"][0] / 10
+    assert 1 / 5 < found.error / true_error(found, cone) < 8
+
+
+def test_the_round_before_is_a_witness():
+    """Its solution was off by 0.01 and it had thought so: then the next estimate is believed, else it is doubled."""
+    sol = js.solve(GOOD, line(0.05), order=4)
+    before = remembered(sol)
+    was = Earlier(before.points, before.values + 0.01 * np.abs(sol.u).max())
+    rows = lambda thought, left, order=4: [(9, 6, 1.0, 0.0, 0.1), (20, 4, thought, 0, 0.1), (20, order, left, 0, 0.1)]  # noqa: E731
+    assert unseen(sol, rows(0.0101, 1e-4), was) == pytest.approx(1.0, abs=1e-3)
+    assert unseen(sol, rows(0.0067, 1e-4), was) == pytest.approx(0.01 / 0.0066, rel=1e-6)
+    assert unseen(sol, rows(0.001, 1e-4), was) == 2.0
+    for told in (rows(0.0101, 0.005), rows(0.0101, 1e-4, order=6), rows(np.inf, 1e-4)):
+        assert unseen(sol, told, was) == 2.0
+    assert unseen(sol, rows(0.0101, 1e-4), None) == 2.0
 
 
 def test_where_a_side_stops_being_held_the_values_are_in_doubt():
