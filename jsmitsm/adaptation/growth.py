@@ -8,7 +8,7 @@ from collections.abc import Sequence
 _MOST, _SMALL = 5.0, {1: 400, 2: 1500, 3: 3000}
 # One of more than so many grows at least by this factor: rounds that gain little are dear. (By as much as the last two
 # rounds say it takes is worse: where smoothness ends it takes rounds to find out, and three times the particles.)
-_LARGE, _LEAST = 4000, 1.65
+_LARGE, _LEAST = 4000, 1.75
 # After so many rounds without a smaller error by this factor the search ends.
 _STALLED, _BETTER = 3, 0.7
 
