@@ -12,8 +12,8 @@ from jsmitsm.evolution.steps import dense_output
 from jsmitsm.runtime.progress import PENCIL, bar
 from jsmitsm.taylor.multi_indices import HIGHEST
 
-# So many times are looked at; of waves, which an error accompanies, each that the steps know up to so many.
-LOOKS, OF_WAVES = 10, 400
+# So many times are looked at.
+LOOKS = 10
 
 
 @bar("error estimate", parts=(*PENCIL, ("times", 4.0)))
@@ -28,7 +28,7 @@ def in_space(
     semi, (steps, values) = run.semi, history
     if len(steps) < 2 or run.timed.quasilinear or run.order + 2 > HIGHEST:
         return steps[[0, -1]], np.zeros((2, semi.n, semi.fields))
-    grid = np.linspace(steps[0], steps[-1], min(OF_WAVES if semi.second else LOOKS, len(steps) - 1) + 1)
+    grid = np.linspace(steps[0], steps[-1], min(LOOKS, len(steps) - 1) + 1)
     # Pairs of fields that drive one another are the ones that are damped.
     integrated = _travelled if semi.second else _summed if run.damping else _integrated
     errors = integrated(semi, run.finer(), steps, values, rates, grid)
@@ -67,17 +67,21 @@ def _integrated(
 def _travelled(
     semi: Semidiscrete, high: Semidiscrete, steps: Any, values: Any, rates: Any, grid: np.ndarray
 ) -> np.ndarray:
-    """The same of second order in time, by the midpoint rule: nothing dies out, and what is left over travels with the
-    error that it makes, which grows all the way."""
-    h = float(grid[1] - grid[0])
+    """The same of second order in time, by the midpoint rule in as many steps as the run took.
+
+    Nothing dies out, and what is left over travels with the error that it makes, which grows all the way.
+    """
+    many = -(-(len(steps) - 1) // (len(grid) - 1))
+    h = float(grid[1] - grid[0]) / many
     resolvent, nothing = high.system.resolvent(0.5 * h), np.zeros(len(high.held))
     y, out = np.zeros(high.system.size), [np.zeros((semi.n, semi.fields))]
-    with bar("times", len(grid) - 1) as shown:
-        for t in 0.5 * (grid[1:] + grid[:-1]):
-            misfit = high.system.force(_misfit(semi, high, steps, values, rates, float(t)))
-            y = 2.0 * resolvent.solve(high.system.mass(y) + 0.5 * h * misfit) - y
+    with bar("times", many * (len(grid) - 1)) as shown:
+        for begin in grid[:-1]:
+            for t in begin + h * (np.arange(many) + 0.5):
+                misfit = high.system.force(_misfit(semi, high, steps, values, rates, float(t)))
+                y = 2.0 * resolvent.solve(high.system.mass(y) + 0.5 * h * misfit) - y
+                shown.update(1)
             out.append(high.placed(y[: high.system.n], nothing))
-            shown.update(1)
     return np.stack(out)
 
 
