@@ -102,6 +102,29 @@ def time(plt):
     return fig
 
 
+def following(plt):
+    """A torch that circles on a plate, four moments: temperature and particles."""
+    disk = lambda spacing: js.from_sdf(js.sdf.circle((0.0, 0.0), 1.0), ((-1.1, -1.1), (1.1, 1.1)), spacing)  # noqa: E731
+
+    def torch(x, t):
+        centre = 0.5 * jnp.stack([jnp.cos(2.0 * t), jnp.sin(2.0 * t)])
+        return 20.0 * jnp.exp(-jnp.sum((x - centre) ** 2) / 0.005)
+
+    plate = js.Problem(
+        lambda u, x, t: js.dt(u)(x) - 0.1 * js.laplacian(u)(x) - torch(x, t), {"boundary": js.dirichlet(0.0)}
+    )
+    run = js.evolve(plate, disk(0.06), 0.0, t=(0.0, 2.4), steps=96, readapt=js.Readapt(disk, 1e-2, times=12))
+    print(run.diagnose())
+    fig, axes = plt.subplots(1, 4, figsize=(11, 3.2), layout="constrained")
+    for ax, t in zip(axes, (0.2, 0.8, 1.6, 2.4)):
+        state = run.at(t)
+        js.plot.solution(state, colorbar=False, ax=ax)
+        ax.scatter(*state.cloud.points.T, s=2.0, color="white", linewidths=0)
+        ax.set_title(f"t = {t:.1f}, {len(state.cloud)} particles", fontsize="medium")
+        ax.set_axis_off()
+    return fig
+
+
 def adaptation(plt):
     """A corner singularity to 1e-6, its place unknown."""
     case = NIST["corner-270"]()
@@ -126,7 +149,7 @@ def regions(plt):
     return fig
 
 
-PICTURES = ("first", "slices", "errors", "regions", "modes", "time", "adaptation")
+PICTURES = ("first", "slices", "errors", "regions", "modes", "time", "following", "adaptation")
 
 
 def main(names=PICTURES):

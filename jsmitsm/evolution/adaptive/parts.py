@@ -147,8 +147,8 @@ class Marcher:
 
     def _everywhere(self, points: np.ndarray) -> np.ndarray:
         """The start (M, F), a function, at many points (M, D)."""
-        one = lambda x: jnp.stack([jnp.asarray(v, float) for v in jnp.atleast_1d(jnp.asarray(self.u0(x)))])  # noqa: E731
-        return np.asarray(jax.vmap(one)(jnp.asarray(points))).reshape(len(points), self.problem.fields)
+        fields = self.problem.fields
+        return np.asarray(jax.vmap(lambda x: jnp.broadcast_to(jnp.asarray(self.u0(x), float), (fields,)))(points))
 
     def _start(self, begin: float) -> tuple[Any, ...]:
         """Values (N, F) that the part begins with."""
