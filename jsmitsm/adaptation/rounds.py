@@ -318,7 +318,8 @@ class Rounds:
         else:
             number, again = self.number or 0.0, float(np.asarray(self.quantity(other)).sum())
             apart = abs(again - number) / (abs(number) or 1.0)
-        if apart > max(self.error, self.tol):
+        # A number is made of more than values, slopes of polynomials for instance, of which the other order knows more.
+        if apart > (max(self.error, self.tol) if self.quantity is None else self.error):
             own = measured(other, h, self._operator_order(other), self.norm, self.quantity).error
             if not (np.isfinite(own) and own > _OTHERS * apart):
                 self.error = apart

@@ -115,6 +115,17 @@ def test_the_tolerance_is_on_the_number():
     assert found.reached and away <= 3e-4
 
 
+@pytest.mark.parametrize("at, tol", [((0.0, 0.5), 1e-3), ((0.0, 0.5), 1e-4), ((0.3, 0.2), 1e-3)])
+def test_the_error_of_a_slope_is_more_than_that_of_the_values(at, tol):
+    """Of a smooth solution: the polynomial's slope misses ten times what the values below it make of it."""
+    exact = lambda x: jnp.exp(2 * x[0]) * jnp.sin(5 * x[1])  # noqa: E731
+    problem = js.Problem(lambda u, x: js.laplacian(u)(x) + 21 * exact(x), {"boundary": js.dirichlet(exact)})
+    slope = lambda sol: sol.grad(np.array([at]))[0, 0]  # noqa: E731
+    found = js.adapt(problem, lambda h: js.from_polygon(SQUARE, h), tol, quantity=slope, progress=False)
+    true = float(jax.grad(exact)(jnp.array(at))[0])
+    assert found.reached and 0.5 < found.error / abs(found.quantity / true - 1.0) < 2.0
+
+
 def test_what_limits_is_said():
     problem = js.Problem(lambda u, x: js.laplacian(u)(x) + jnp.sin(40.0 * x[0]), ends(0.0, 0.0))
     few = js.adapt(problem, line, 1e-10, order=2, depth=0, max_particles=40)
