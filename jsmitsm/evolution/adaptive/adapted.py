@@ -111,8 +111,14 @@ class AdaptedEvolution:
         >>> ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(0.0)}
         >>> heat = js.Problem(lambda u, x, t: js.dt(u)(x) - js.laplacian(u)(x), ends)
         >>> line = lambda spacing: js.interval(0.0, 1.0, spacing=spacing)
-        >>> start, follow = lambda x: jnp.sin(jnp.pi * x[0]), js.Readapt(line, 1e-4, times=2)
-        >>> run = js.evolve(heat, line(0.05), start, t=(0.0, 0.1), steps=20, readapt=follow)
+        >>> run = js.evolve(
+        ...     heat,
+        ...     line(0.05),
+        ...     lambda x: jnp.sin(jnp.pi * x[0]),
+        ...     t=(0.0, 0.1),
+        ...     steps=20,
+        ...     readapt=js.Readapt(line, 1e-4, times=2),
+        ... )
         >>> round(float(run.at(0.05)([[0.5]])[0]), 3)
         0.611
         """
@@ -137,8 +143,14 @@ class AdaptedEvolution:
         >>> ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(0.0)}
         >>> heat = js.Problem(lambda u, x, t: js.dt(u)(x) - js.laplacian(u)(x), ends)
         >>> line = lambda spacing: js.interval(0.0, 1.0, spacing=spacing)
-        >>> start, follow = lambda x: jnp.sin(jnp.pi * x[0]), js.Readapt(line, 1e-4, times=2)
-        >>> run = js.evolve(heat, line(0.05), start, t=(0.0, 0.1), steps=20, readapt=follow)
+        >>> run = js.evolve(
+        ...     heat,
+        ...     line(0.05),
+        ...     lambda x: jnp.sin(jnp.pi * x[0]),
+        ...     t=(0.0, 0.1),
+        ...     steps=20,
+        ...     readapt=js.Readapt(line, 1e-4, times=2),
+        ... )
         >>> "FLAG" in run.diagnose()
         False
         """
