@@ -9,7 +9,7 @@ from typing import Any, Literal, TypedDict, Unpack
 
 import numpy as np
 
-from jsmitsm.adaptation.first_cloud import Make, first_cloud
+from jsmitsm.adaptation.first_cloud import Make, first_cloud, refuse_no_maker
 from jsmitsm.adaptation.measure import NORMS, Quantity
 from jsmitsm.adaptation.rounds import ORDERS, Rounds
 from jsmitsm.cloud.cloud import Cloud
@@ -216,11 +216,7 @@ def _checked(problem, make, tol, order, start, quantity, norm, max_particles, ma
     if not isinstance(problem, Problem):
         raise ValueError(f"problem: expected a js.Problem, got {type(problem).__name__}")
     refuse_extras(problem)
-    if not callable(make):
-        raise ValueError(
-            f"make: expected a function spacing -> js.Cloud, got {type(make).__name__}; write for instance "
-            "lambda spacing: js.from_polygon(vertices, spacing)"
-        )
+    refuse_no_maker(make)
     if not is_number(tol) or not 0.0 < tol < 1.0:
         raise ValueError(f"tol: expected a relative error between 0 and 1, got {short(tol)}")
     if not is_one_of(order, ["auto"]) and not is_whole(order, 1):

@@ -24,14 +24,29 @@ _COARSE = 0.2
 Make = Callable[[Any], Cloud]
 
 
-def made(make: Make, spacing: Any) -> Cloud:
-    """A cloud from the user's maker, on which errors will be estimated; ValueError where it is none."""
+def refuse_no_maker(make: Any) -> None:
+    """ValueError for what is no function from a spacing to a cloud."""
+    if not callable(make):
+        raise ValueError(
+            f"make: expected a function spacing -> js.Cloud, got {type(make).__name__}; write for instance "
+            "lambda spacing: js.from_polygon(vertices, spacing)"
+        )
+
+
+def cloud_of(make: Make, spacing: Any) -> Cloud:
+    """A cloud from the user's maker; ValueError where it is none."""
     cloud = make(spacing)
     if not isinstance(cloud, Cloud):
         raise ValueError(
             f"make: returned {type(cloud).__name__}, expected a js.Cloud; it is called with a spacing, a number or a "
             "function (M, D) -> (M,), as in lambda spacing: js.from_polygon(vertices, spacing)"
         )
+    return cloud
+
+
+def made(make: Make, spacing: Any) -> Cloud:
+    """A cloud from the user's maker, on which errors will be estimated."""
+    cloud = cloud_of(make, spacing)
     expect_estimate(cloud)
     return cloud
 

@@ -70,7 +70,8 @@ def marks(
     trustworthy; then all fall at the rate ``expected``, that of a smooth solution if None. edge (N,): where smoothness
     ends, rather than beside. poles (P, D): where it is known to end, between the particles.
     """
-    away, near = cKDTree(points).query(points, k=range(1, min(_WORST, len(points)) + 1))
+    tree = cKDTree(points)
+    away, near = tree.query(points, k=range(1, min(_WORST, len(points)) + 1))
     largest = contribution[near[:, :_NEAR]].max(axis=1)
     rate = np.full(len(points), power if expected is None else expected)
     if before is not None:
@@ -97,7 +98,7 @@ def marks(
         rate[at] = _SUSPECTED
     sure = np.zeros(0, int)
     if poles is not None and len(poles):
-        sure = _lone(points, spacing, np.unique(cKDTree(points).query(poles)[1]))
+        sure = _lone(points, spacing, np.unique(tree.query(poles)[1]))
     rate[sure] = np.minimum(rate[sure], _SUSPECTED)
     singular, located = _singular(points, spacing, np.unique(at), before, sure)
     return Marks(points, spacing, largest, np.clip(rate, _SLOWEST, power), singular, located)

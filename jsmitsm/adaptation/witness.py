@@ -16,7 +16,7 @@ from jsmitsm.solution.solution import Solution
 
 # Where smoothness ends solutions of two orders miss the same, and are nearer to each other than to what is true: the
 # distance is taken for this part of the error.
-ALIKE = 0.5
+_ALIKE = 0.5
 # What is missed of a source between the particles is that as well, where contributions fall with less than this power:
 # there no mean over a few points tells what its infinite values make.
 _INFINITE = 1.0
@@ -68,13 +68,13 @@ def unseen(sol: Solution, rows: list[Row], earlier: Earlier | None) -> float:
     The round before was off by what the two solutions differ by, about, and thought it was off by its estimate.
     """
     if earlier is None or not len(earlier.points) or rows[-1][1] != rows[-2][1]:
-        return 1.0 / ALIKE
+        return 1.0 / _ALIKE
     thought, left = rows[-2][2], rows[-1][2]
     if not (np.isfinite(thought) and left <= _FALLEN * thought):
-        return 1.0 / ALIKE
+        return 1.0 / _ALIKE
     try:
         now = np.asarray(sol(earlier.points, outside="extrapolate")).reshape(earlier.values.shape)
     except (ValueError, SolveError):
-        return 1.0 / ALIKE  # a source that is infinite on the boundary
+        return 1.0 / _ALIKE  # a source that is infinite on the boundary
     off = float(np.abs(now - earlier.values).max() / np.abs(np.asarray(sol.u)).max())
-    return float(np.clip(off / (thought - left), 1.0, 1.0 / ALIKE))
+    return float(np.clip(off / (thought - left), 1.0, 1.0 / _ALIKE))

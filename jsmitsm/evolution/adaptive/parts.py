@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jsmitsm.adaptation.first_cloud import FIRST
+from jsmitsm.adaptation.first_cloud import FIRST, cloud_of
 from jsmitsm.adaptation.marking import GENTLY, marks, next_spacing
 from jsmitsm.adaptation.spacing_field import SpacingField
 from jsmitsm.cloud.cloud import Cloud
@@ -194,9 +194,7 @@ class Marcher:
         self.cloud, self.spacing = self._made_cloud(field), field
 
     def _made_cloud(self, spacing: SpacingField) -> Cloud:
-        cloud = self.plan.make(spacing)
-        if not isinstance(cloud, Cloud):
-            raise ValueError(f"make: returned {type(cloud).__name__}, expected a js.Cloud")
+        cloud = cloud_of(self.plan.make, spacing)
         if set(cloud.groups) != self.groups:
             raise ValueError(
                 f"make: its cloud has the groups {sorted(cloud.groups)}, that of the start {sorted(self.groups)}; give "

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
+from jsmitsm.adaptation.first_cloud import Make, refuse_no_maker
 from jsmitsm.runtime.errors import explaining, is_number, is_whole, short
 
 
@@ -36,18 +35,14 @@ class Readapt:
     20
     """
 
-    make: Callable[[Any], Any]
+    make: Make
     tol: float
     times: int = 20
     max_particles: int = 300_000
 
     @explaining
     def __post_init__(self) -> None:
-        if not callable(self.make):
-            raise ValueError(
-                f"make: expected a function spacing -> js.Cloud, got {type(self.make).__name__}; write for instance "
-                "lambda spacing: js.from_polygon(vertices, spacing)"
-            )
+        refuse_no_maker(self.make)
         if not is_number(self.tol) or not 0.0 < self.tol < 1.0:
             raise ValueError(f"tol: expected a relative error between 0 and 1, got {short(self.tol)}")
         for value, name in ((self.times, "times"), (self.max_particles, "max_particles")):
