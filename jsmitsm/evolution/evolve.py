@@ -159,11 +159,11 @@ def evolve(
     began = time.perf_counter()
     check(problem, cloud, t, steps, tol, order, scheme, throw, progress)
     several = of_regions(problem, cloud)
-    if readapt is not None:
-        _refuse_readapt(readapt, several, stencils, is_traced(problem, cloud, u0, t))
     made: Any = regions_timed(problem, cloud) if several else timed(problem, cloud)  # type: ignore[arg-type]
     second = bool(made.masses[1].slots)
     start = starting_values(u0, cloud, problem.fields, second)
+    if readapt is not None:
+        _refuse_readapt(readapt, several, stencils, made, is_traced(problem, cloud, start, t))
     options: dict[str, Any] = {
         "order": int(order), "scheme": scheme, "damping": damping, "stencils": stencils, "throw": throw,
         "depth": 0 if depth == "auto" else depth,
@@ -175,7 +175,6 @@ def evolve(
     else:
         parts = saved_times(save, float(t[0]), float(t[1]))
     if readapt is not None:
-        refuse_what_does_not_damp(made)
         span = float(t[0]), float(t[1])
         with bar("evolve", wanted=progress, parts=(("parts", 1.0),)):
             return followed(problem, cloud, u0, span, steps, tol, parts, readapt, options)
@@ -194,14 +193,15 @@ def evolve(
 
 
 
-def _refuse_readapt(readapt: Any, several: bool, stencils: Any, traced: bool) -> None:
+def _refuse_readapt(readapt: Any, several: bool, stencils: Any, made: Any, traced: bool) -> None:
     if not isinstance(readapt, Readapt):
         raise ValueError(f"readapt: expected js.Readapt(make, tol), got {short(readapt)}")
     if several:
         raise ValueError("readapt: clouds of several regions are not made anew on the way; leave it out")
     if stencils is not None:
         raise ValueError("stencils: belong to one cloud, and readapt makes others; leave one of them out")
-    if traced:
+    if traced or is_traced(made.problem, made.rest, made.masses, made.apart):  # functions may close over what is traced
         raise ValueError(
             "readapt: no cloud can be made from traced values; differentiate js.evolve on one cloud, without readapt"
         )
+    refuse_what_does_not_damp(made)
