@@ -1,8 +1,8 @@
 """Problems for adaptive methods: W. F. Mitchell, A collection of 2D elliptic problems for testing adaptive grid
 refinement algorithms, Appl. Math. Comput. 220 (2013), with their published parameters, and some in 1D and 3D.
 
-The battery, whose solution is not known, is left out. A slit of 2 pi is opened by a hair. The intersecting interfaces
-are taken with r^0.5 besides the published r^0.1.
+The solution of the battery is known at some points (:mod:`benchmarks.battery`). A slit of 2 pi is opened by a hair. The
+intersecting interfaces are taken with r^0.5 besides the published r^0.1.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jsmitsm as js
+from benchmarks import battery
 
 UNIT = ((0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0))
 SQUARE = ((-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0))
@@ -27,7 +28,7 @@ class Case(NamedTuple):
 
     operator: diffusion, wind and reaction (a function, None without one) of scalar problems other than Poisson's, for
     who states it in another form; homogeneous: without a source. quantity, number: what the tolerance is on instead
-    of the solution, and its exact value.
+    of the solution, and its exact value. known: points and values of a solution without a formula.
     """
 
     name: str
@@ -39,6 +40,7 @@ class Case(NamedTuple):
     homogeneous: bool = False
     quantity: Callable[[js.Solution], Any] | None = None
     number: float | None = None
+    known: tuple[np.ndarray, np.ndarray] | None = None
 
 
 def _polygon(name: str, polygon: Any, exact: Any, pde: Any, fields: int = 1) -> Case:
@@ -242,6 +244,10 @@ def crossing(a: float) -> Case:
     return Case(f"intersecting interfaces, r^{a}", problem, make, exact)
 
 
+def thermal_battery() -> Case:
+    return Case("battery", battery.problem(), battery.make, None, known=battery.known())
+
+
 def point_value() -> Case:
     """The corner of 3 pi / 2 again, for one value beside it."""
     case, at = reentrant(1.5 * np.pi, "3 pi / 2"), np.array([-0.1, 0.1])
@@ -309,6 +315,7 @@ CASES: dict[str, Callable[[], Case]] = {
     "corner-360": lambda: reentrant(2 * np.pi, "2 pi"),
     "elastic-1": lambda: elastic(1),
     "elastic-2": lambda: elastic(2),
+    "battery": thermal_battery,
     "peak-3": lambda: peak(1e3, (0.5, 0.5)),
     "peak-5": lambda: peak(1e5, (0.51, 0.117)),
     "layer-1": lambda: layer(1e-1),
@@ -330,4 +337,3 @@ CASES: dict[str, Callable[[], Case]] = {
     "fichera": fichera,
     "edge": edge,
 }
-LEFT_OUT = ("battery",)

@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 from jsmitsm.adaptation.spacing_field import SpacingField
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.discretization.coefficients import expect_estimate
+from jsmitsm.runtime.errors import TooCoarse
 
 # Particles of the first cloud, by dimension: enough for the estimate of a low order, and not more.
 FIRST = {1: 25, 2: 200, 3: 700}
@@ -116,12 +117,8 @@ def _finer(make: Make, size: float) -> tuple[float, Cloud]:
     for attempt in range(_TRIES):
         try:
             return size, made(make, size)
-        except ValueError as error:
-            if not _too_coarse(error) or attempt == _TRIES - 1:
+        except TooCoarse:
+            if attempt == _TRIES - 1:
                 raise
             size *= _FINER
     raise AssertionError
-
-
-def _too_coarse(error: ValueError) -> bool:
-    return "too coarse" in str(error)

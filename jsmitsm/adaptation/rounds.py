@@ -19,7 +19,7 @@ from jsmitsm.adaptation.spacing_field import SpacingField
 from jsmitsm.adaptation.witness import Earlier, doubted, remembered, stands_out, unseen
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.equation.problem import Problem
-from jsmitsm.runtime.errors import SolveError
+from jsmitsm.runtime.errors import SolveError, TooCoarse, TooFine
 from jsmitsm.solution.solution import Solution
 from jsmitsm.solution.solve import solve
 
@@ -239,9 +239,7 @@ class Rounds:
                 break
             try:
                 found = self._cloud(finer)
-            except ValueError as error:
-                if "cells" not in str(error):
-                    raise
+            except TooFine:
                 coarse *= 4.0
                 continue
             if len(found) <= most:
@@ -354,12 +352,12 @@ class Rounds:
         for attempt in range(8):
             try:
                 following = self._cloud(field)
-            except ValueError as refusal:
-                if "cells" not in str(refusal) and "too coarse" not in str(refusal):
-                    raise
+            except TooFine:
                 coarser = np.maximum(field.spacing, 4.0 * field.spacing.min())
-                few = "cells" in str(refusal)
-                field = SpacingField(field.points, coarser, field.largest) if few else field.scaled(0.7)
+                field = SpacingField(field.points, coarser, field.largest)
+                continue
+            except TooCoarse:
+                field = field.scaled(0.7)
                 continue
             if len(following) > self.max_particles:
                 field = field.scaled((1.1 * len(following) / self.max_particles) ** (1.0 / cloud.dim))

@@ -11,6 +11,7 @@ import numpy as np
 from jsmitsm.cloud import filling, levelset
 from jsmitsm.cloud.packing import octree, relaxation
 from jsmitsm.cloud.packing.octree import Spacing
+from jsmitsm.runtime.errors import TooCoarse
 
 _CORNER = np.cos(np.deg2rad(8.0))  # normals that differ by more, however close, make a corner
 
@@ -35,7 +36,7 @@ def contour(region: levelset.SdfRegion, spacing: Spacing, forced: np.ndarray | N
     cells, coarse = levelset.cells_near(region, spacing, 0.4)
     loops = _without_tips(region, _polylines(region, cells, coarse), spacing)
     if not loops:
-        raise ValueError("spacing: too coarse for the shape, no boundary was found; reduce it below the shape's width")
+        raise TooCoarse("spacing: too coarse for the shape, no boundary was found; reduce it below the shape's width")
     parts = [_divided_loop(region, loop, spacing, forced) for loop in loops]
     boundary = levelset.Boundary(*(np.concatenate(arrays) for arrays in zip(*parts)))
     _check_seen(region, cells, np.concatenate([*(loop.points for loop in loops), boundary.points]))
@@ -66,7 +67,7 @@ def _without_tips(
             tree = cKDTree(np.concatenate([other for other, _ in large])) if large else None
             lone = tree is None or tree.query(loop)[0].min() > float(spacing(loop).max())
             if lone or region.values(middle)[0] > 0:
-                raise ValueError(
+                raise TooCoarse(
                     f"spacing: too coarse for the shape, a closed boundary near {loop[0]} is only "
                     f"{length:.2g} times as long as the spacing, at least {levelset.LEAST:g} are needed; reduce the "
                     "spacing there (it may be a "
@@ -193,7 +194,7 @@ def _check_seen(region: levelset.SdfRegion, cells: octree.Cells, found: np.ndarr
     shift = 1e-4 * width[:, None] * outward
     real = (region.values(x + shift) > 0) & (region.values(x - shift) < 0)
     if real.any():
-        raise ValueError(
+        raise TooCoarse(
             f"spacing: too coarse for the shape, whose boundary near {x[real][0]} is smaller than half a spacing; "
             "reduce the spacing there (it may be a function of the position)"
         )

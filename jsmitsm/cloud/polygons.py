@@ -15,7 +15,7 @@ from jsmitsm.cloud import filling, levelset
 from jsmitsm.cloud.lattices.path import followed
 from jsmitsm.cloud.packing import relaxation
 from jsmitsm.cloud.packing.octree import Spacing
-from jsmitsm.runtime.errors import listed, numbers
+from jsmitsm.runtime.errors import TooCoarse, listed, numbers
 
 _SHARP = np.deg2rad(20.0)  # a vertex that turns by more is a corner of the shape, not a sample of a curve
 
@@ -179,7 +179,7 @@ def edge_particles(
     paths = [followed(a, b, spacing) for a, b in zip(loop, ahead)]
     lengths = np.array([filling.path_lengths(path, spacing)[-1] for path in paths])
     if lengths.sum() < levelset.LEAST:
-        raise ValueError(
+        raise TooCoarse(
             f"spacing: too coarse for the shape, the outline of {name} is only "
             f"{lengths.sum():.2g} times as long as the spacing, at least {levelset.LEAST:g} are needed"
         )
@@ -188,7 +188,7 @@ def edge_particles(
         sharp = sharp | forced
     tight = np.flatnonzero(sharp & np.roll(sharp, -1) & (lengths < 0.1))
     if len(tight):
-        raise ValueError(
+        raise TooCoarse(
             f"spacing: too coarse for the shape, the edge of {name} from {loop[tight[0]]} to {ahead[tight[0]]} is only "
             f"{lengths[tight[0]]:.2g} spacings long; reduce the spacing there or simplify the polygon"
         )

@@ -7,6 +7,7 @@ import numpy as np
 from jsmitsm.cloud import levelset
 from jsmitsm.cloud.packing import relaxation
 from jsmitsm.cloud.packing.octree import Spacing
+from jsmitsm.runtime.errors import TooCoarse
 
 _CORNER = np.cos(np.deg2rad(8.0))  # sides whose normals differ by more meet in an edge
 
@@ -25,7 +26,7 @@ def surface(region: levelset.SdfRegion, spacing: Spacing, seed: int) -> levelset
     arrived[arrived] = _crossing(region, feet[arrived], normals[arrived])
     feet, area = feet[arrived], width[arrived] ** 2 / 1.2  # volume of the layer over its thickness
     if not len(feet):
-        raise ValueError("spacing: too coarse for the shape, no boundary was found; reduce it below the shape's width")
+        raise TooCoarse("spacing: too coarse for the shape, no boundary was found; reduce it below the shape's width")
     h = spacing(feet)
     points = _sparse(feet, h, float((area / h**2).sum()), rng)
     for steps in (8, 5):
@@ -65,7 +66,7 @@ def _check_components(feet: np.ndarray, pairs: tuple[np.ndarray, np.ndarray, np.
     label = connected_components(graph, directed=False)[1]
     count = np.bincount(label[chosen], minlength=label.max() + 1)
     if count.min() < 10:
-        raise ValueError(
+        raise TooCoarse(
             f"spacing: too coarse for the shape, only {count.min()} particles fit on the closed boundary near "
             f"{feet[label == count.argmin()][0]}, at least 10 are needed; reduce the spacing there"
         )

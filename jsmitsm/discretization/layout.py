@@ -280,7 +280,7 @@ def split(disc: Discretization, cls: Class) -> list[Class]:
     parts = []
     for count, less in sorted(set(zip(own.tolist(), lost.tolist()))):
         at = np.flatnonzero((own == count) & (lost == less))
-        scheme = replace(cls.scheme, n_own=count, lost=less)
+        scheme = cls.scheme.with_own(count, less)
         parts.append(Class(cls.ids[at], cls.neighbours[at], scheme, cls.wide))
     return parts
 

@@ -16,7 +16,7 @@ from jsmitsm.cloud.packing.octree import morton
 from jsmitsm.cloud.shapes import checked_bounds, checked_seed, from_sdf, grouped, own_normals
 from jsmitsm.parallel.distributed import ParallelCloud, Slab, placed, slab_of
 from jsmitsm.parallel.team import Team, collective, team
-from jsmitsm.runtime.errors import short
+from jsmitsm.runtime.errors import TooCoarse, short
 
 # A graded shape of fewer particles is made whole by the first process: each part would start from all of them.
 WHOLE = 20_000
@@ -136,7 +136,7 @@ def _numbered(
     counts = us.gather(len(inside))
     with us.phase():
         if not sum(counts):
-            raise ValueError("spacing: too coarse for the shape, which has no interior particle; reduce it")
+            raise TooCoarse("spacing: too coarse for the shape, which has no interior particle; reduce it")
     group = np.zeros(len(boundary.points), int)
     for k, members in enumerate(named.values()):
         group[members] = k + 1

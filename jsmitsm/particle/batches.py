@@ -48,7 +48,7 @@ _LARGE = 28
 SMALL = 66
 
 # How often the local phase was compiled; read by the tests.
-TRACES = {"rows": 0, "coefficients": 0}
+TRACES = {"rows": 0, "coefficients": 0, "joints": 0}
 
 
 class Operands(NamedTuple):
@@ -248,15 +248,15 @@ def _mapped(particle: Any, ids: Any, neighbours: Any, operands: Operands, *more:
     # Arrays without numbers cannot be cut into blocks: None stands for them on the way.
     empty: dict[int, tuple[int, ...]] = {}
     each = _without_empty([None if one_for_all else operands.jac, operands.own, *more])
-    made = _in_blocks(one, (ids, neighbours, *each), operands.count)
+    made = in_blocks(one, (ids, neighbours, *each), operands.count)
     leaves, shape = jax.tree.flatten(made, is_leaf=lambda x: x is None)
     full = [jnp.zeros((ids.shape[0], *empty[k])) if k in empty else x for k, x in enumerate(leaves)]
     return jax.tree.unflatten(shape, full)
 
 
-def _in_blocks(one: Any, arrays: Any, count: Any) -> Any:
+def in_blocks(one: Any, arrays: Any, count: Any) -> Any:
     """``one`` of every particle; of the first ``count`` alone where no derivative will be taken."""
-    n, on_cpu = arrays[0].shape[0], jax.default_backend() == "cpu"
+    n, on_cpu = jax.tree.leaves(arrays)[0].shape[0], jax.default_backend() == "cpu"
     block = min(n, BLOCK if on_cpu else _WIDE)
     if not (only_run() and on_cpu):
         return jax.lax.map(jax.checkpoint(one), arrays, batch_size=block)

@@ -63,6 +63,13 @@ class Scheme:
     flat: bool = False
     uneven: bool = False
 
+    def with_own(self, count: int, lost: int) -> Scheme:
+        """The scheme of particles with so many conditions of their own and rows that add nothing.
+
+        Without conditions it says nothing of what those of others are about: one program serves all regions.
+        """
+        return replace(self, n_own=count, lost=lost, own=self.own if count else ())
+
     @property
     def decay(self) -> float:
         """Without a kernel the weight is exp(-(decay r / r_max)^2). Deeper polynomials are true farther out, and

@@ -25,8 +25,9 @@ from jsmitsm.particle.moments import Row, Support
 from jsmitsm.particle.polynomials import functionals, monomials
 from jsmitsm.particle.recursion import row_lifts
 from jsmitsm.particle.small_systems import gram_inverse, min_norm, null_space, safe_root, solve_gram
-from jsmitsm.runtime.size_classes import BLOCK, padded_size
-from jsmitsm.runtime.tracers import recorded
+from jsmitsm.runtime.compiled import at_hand
+from jsmitsm.runtime.size_classes import cloud_size, largest_at_hand, open_size, padded_size
+from jsmitsm.runtime.tracers import is_traced, recorded
 from jsmitsm.runtime.whole_program import called
 from jsmitsm.taylor.multi_indices import Slot, factorial, index_of, multi_indices
 
@@ -75,21 +76,30 @@ class _Joint(NamedTuple):
 
 
 def _in_size_class(function: Any) -> Any:
-    """Compile ``function(scheme, points, sides, coef, more)`` for padded arrays, and return what is not padding."""
+    """Compile ``function(scheme, points, sides, coef, count, more)`` for padded arrays; what is padding is cut off.
+
+    All sides are padded alike, so that one program serves joints of regions of several sizes.
+    """
     inner = jax.jit(function, static_argnames="scheme")
+    compiled: dict[Any, set[int]] = {}
 
     def padded(scheme: JointScheme, points: Any, sides: tuple[Side, ...], coef: Any, more: Any = ()) -> Any:
         n = coef.shape[0]
-        size = padded_size(n)
-        points = tuple(batches.in_cloud_size(x, len(x)) for x in points)
+        loose = not (recorded() or is_traced(points, sides, coef, more))
+        widths = tuple(s.neighbours.shape[1] for s in sides)
+        known = compiled.setdefault((scheme, widths, recorded()), set())
+        size = at_hand(known, n, largest_at_hand(n), open_size(n)) if loose else padded_size(n)
+        largest = cloud_size(max(len(x) for x in points))
+        points = tuple(batches.widened(x, len(x), largest) for x in points)
         if more:
-            more = (tuple(batches.in_cloud_size(x, len(x)) for x in more[0]), *batches.widened(more[1:], n, size))
+            more = tuple(batches.widened(x, len(x), largest) for x in more[0]), *batches.widened(more[1:], n, size)
         made = []
         for s in sides:
             ids, near, own = batches.widened((s.ids, s.neighbours, s.own), n, size)
             jac = s.jac if s.jac.shape[0] == 1 else batches.widened(s.jac, n, size)
             made.append(Side(ids, near, jac, own, s.shared))
         given = {"points": points, "sides": tuple(made), "coef": batches.widened(coef, n, size), "more": more}
+        given["count"] = np.int32(n)
         if recorded():
             return batches.cut(inner(scheme, **given), n)
         return batches.cut(called(function, {"scheme": scheme}, given, tuple(batches.effort(size).items())), n)
@@ -98,7 +108,9 @@ def _in_size_class(function: Any) -> Any:
 
 
 @_in_size_class
-def joint_rows(scheme: JointScheme, points: Any, sides: tuple[Side, ...], coef: Any, more: Any = ()) -> tuple[Row, ...]:
+def joint_rows(
+    scheme: JointScheme, points: Any, sides: tuple[Side, ...], coef: Any, count: Any, more: Any = ()
+) -> tuple[Row, ...]:
     """The equations of all copies of n joints, a ``Row`` for every side with the joint's axis first.
 
     Their weights run over the neighbours of all sides, one side after the other; ``source`` over the rows of all
@@ -106,16 +118,20 @@ def joint_rows(scheme: JointScheme, points: Any, sides: tuple[Side, ...], coef: 
     (n, n_rows, S), and then over every side's own.
     """
 
+    batches.TRACES["joints"] += 1
+
     def one(given: Any) -> tuple[Row, ...]:
         return _rows(scheme, _joint(scheme, points, sides, *given))
 
-    made = jax.lax.map(jax.checkpoint(one), (_each(sides), coef), batch_size=BLOCK)
+    made = batches.in_blocks(one, (_each(sides), coef), count)
     # No neighbour's condition is data here.
     return tuple(row._replace(data=jnp.zeros((*row.weights.shape[:3], 0))) for row in made)
 
 
 @_in_size_class
-def joint_coefficients(scheme: JointScheme, points: Any, sides: tuple[Side, ...], coef: Any, more: Any) -> Any:
+def joint_coefficients(
+    scheme: JointScheme, points: Any, sides: tuple[Side, ...], coef: Any, count: Any, more: Any
+) -> Any:
     """Taylor coefficients (n, F, K) of the copies on every side.
 
     more: the values (N_s, F) of every side's particles; source (n, rows of all) and given (n, conditions) as the rows
@@ -130,7 +146,7 @@ def joint_coefficients(scheme: JointScheme, points: Any, sides: tuple[Side, ...]
         seen = [u[jnp.where(s[1] >= 0, s[1], s[0])].reshape(-1) for u, s in zip(data, each)]
         return _expanded(scheme, joint, jnp.concatenate(seen), f, g)
 
-    return jax.lax.map(jax.checkpoint(one), ((_each(sides), coef), source, given), batch_size=BLOCK)
+    return batches.in_blocks(one, ((_each(sides), coef), source, given), count)
 
 
 def _each(sides: tuple[Side, ...]) -> Any:

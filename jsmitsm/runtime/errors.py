@@ -88,6 +88,14 @@ _PLACE = re.compile(r" \(docs: [\w#/-]+\)")
 _LONGEST = 200  # letters of a value that a message quotes
 
 
+class TooCoarse(ValueError):
+    """A spacing too large for the shape: with a smaller one it may do."""
+
+
+class TooFine(ValueError):
+    """A spacing too small for the size of the domain: with a larger one it may do."""
+
+
 class SolveError(RuntimeError):
     """A solve that failed: a singular system, values that are not finite, no convergence.
 

@@ -34,5 +34,5 @@ def largest_at_hand(n: int) -> int:
 
 def cloud_size(n: int) -> int:
     """The size class of a cloud of n particles, which are only looked up: few programs serve all clouds."""
-    bits = max(10, (n - 1).bit_length())
+    bits = max(12, (n - 1).bit_length())
     return 1 << (bits if n > _MANY else bits + bits % 2)

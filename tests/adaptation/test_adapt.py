@@ -189,6 +189,25 @@ def test_outflow_has_a_layer_and_inflow_none():
     assert spacing == pytest.approx([1e-3])
 
 
+def test_a_search_begins_finer_where_a_region_is_thinner_than_its_first_spacing():
+    """A wall of a tenth between two rooms: the maker's refusal of coarse spacings is no end."""
+    box = lambda a, b: [(a, 0.0), (b, 0.0), (b, 1.0), (a, 1.0)]
+    shapes = {"left": box(0, 1), "wall": box(1, 1.1), "right": box(1.1, 2)}
+    k = {"left": 1.0, "wall": 1e-2, "right": 1.0}
+    flux = {name: lambda u, x, n, k=k[name]: k * n @ js.grad(u)(x) for name in k}
+    pdes = {name: lambda u, x, k=k[name]: k * js.laplacian(u)(x) + 1.0 for name in k}
+    meet = {f"{a}|{b}": js.interface(flux={a: flux[a], b: flux[b]}) for a, b in (("left", "wall"), ("wall", "right"))}
+    problem = js.Problem(pdes, {"boundary": js.dirichlet(0.0), **meet})
+    make = lambda spacing: js.regions(shapes, spacing=spacing)
+    with pytest.raises(ValueError, match="'wall'.*too small for the spacing"):
+        make(0.3)
+    found = js.adapt(problem, make, 1e-3, progress=False)
+    at = np.array([[0.5, 0.5], [1.05, 0.5], [1.5, 0.3]])
+    fine = js.solve(problem, make(0.025), order=6)
+    assert found.reached
+    assert np.abs(found.solution(at) - fine(at)).max() < 3e-3 * np.abs(fine.u).max()
+
+
 def test_the_first_cloud_suits_any_size_of_domain():
     for size in (1e-3, 1.0, 1e4):
         cloud, _ = first_cloud(lambda spacing: js.from_polygon(np.multiply(SQUARE, size), spacing), None)  # noqa: B023

@@ -11,6 +11,7 @@ import pytest
 import jsmitsm as js
 from jsmitsm.discretization.regions.layout import discretize_regions
 from jsmitsm.discretization.regions.rows import joints, region_numbers
+from jsmitsm.particle import batches
 from jsmitsm.solution.regions.flags import corners, unlike_polynomials
 from jsmitsm.solution.regions.reach import slowness
 
@@ -70,6 +71,27 @@ def test_a_composite_wall_conducts_as_its_resistances_add_up():
     assert np.abs(sol([[0.05], [0.2], [0.1]]) - np.array([84.0, 32.0, 34.0])).max() < 1e-9
     again = pickle.loads(pickle.dumps(sol))
     assert np.array_equal(again([[0.1]], region="b"), sol([[0.1]], region="b"))
+
+
+def test_interfaces_of_many_materials_share_their_programs():
+    """Strips of other conductivities and other outer conditions, and more of them: nothing new is compiled for them."""
+
+    def solved(count, ratio):
+        edges = np.linspace(0.0, 1.0, count + 1)
+        names = [f"s{i}" for i in range(count)]
+        shapes = {s: [(a, 0), (b, 0), (b, 1), (a, 1)] for s, a, b in zip(names, edges, edges[1:])}
+        flux = conduction({s: ratio**i for i, s in enumerate(names)})
+        meet = {f"{a}|{b}": js.interface(flux={a: flux[a], b: flux[b]}) for a, b in zip(names, names[1:])}
+        robin = js.condition(lambda u, x, n: n @ js.grad(u)(x) + u(x) - 1.0)
+        sides = {"left": lambda x: x[:, 0] == 0.0, "rest": lambda x: x[:, 0] != 0.0}
+        cloud = js.regions(shapes, spacing=0.05, groups=sides)
+        problem = js.Problem(dict.fromkeys(names, laplace), {"left": robin, "rest": js.dirichlet(0.0), **meet})
+        js.solve(problem, cloud, order=4)
+        return batches.TRACES["joints"]
+
+    first = solved(2, 3.0)
+    assert solved(3, 10.0) == first
+    assert solved(4, 0.2) == first
 
 
 def test_jump_source_and_resistance_are_what_they_say():

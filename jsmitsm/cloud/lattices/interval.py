@@ -10,7 +10,7 @@ from jsmitsm.cloud.cloud import INTERIOR, Cloud
 from jsmitsm.cloud.filling import SpacingLike, divide, spacing_function
 from jsmitsm.cloud.lattices.boxes import lattice
 from jsmitsm.cloud.lattices.path import followed
-from jsmitsm.runtime.errors import explaining, short
+from jsmitsm.runtime.errors import TooCoarse, explaining, short
 
 
 @explaining
@@ -56,7 +56,7 @@ def interval(a: float, b: float, n: int | None = None, *, spacing: SpacingLike |
     ends: Any = np.array([[a], [b]], float)
     points = divide(followed(ends[0], ends[1], rule), rule)[0]
     if len(points) < 3:
-        raise ValueError(
+        raise TooCoarse(
             f"spacing: too coarse for the shape, it leaves no particle between {a} and {b}; reduce it to half of "
             f"{b - a:.3g} at the most"
         )

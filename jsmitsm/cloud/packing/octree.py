@@ -12,6 +12,8 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from jsmitsm.runtime.errors import TooFine
+
 Spacing = Callable[[np.ndarray], np.ndarray]
 
 # Base cells along the longest side: what decides how small a part of the domain is noticed at all.
@@ -95,7 +97,7 @@ def refine(
         # corner is the corner: where only this point is fine most of the cell is not, so no cell counts for too many.
         needed = float(np.minimum((width / (fraction * h[split])) ** (dim if inside else dim - 1), _MOST / 1000).sum())
         if needed > _MOST:
-            raise ValueError(
+            raise TooFine(
                 f"spacing: as small as {h[split].min():.3g} in a domain of size {(hi - lo).max():.3g} it takes about "
                 f"{needed:.2g} cells, more than {_MOST:.0e}; enlarge it, or narrow the bounds if they are far too wide"
             )

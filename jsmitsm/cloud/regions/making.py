@@ -18,7 +18,7 @@ from jsmitsm.cloud.regions.region_cloud import RegionCloud
 from jsmitsm.cloud.regions.shapes import Interval, Shape, shape_of
 from jsmitsm.cloud.shapes import Predicate, checked_bounds, checked_seed, grouped, own_normals
 from jsmitsm.runtime.arrays import ArrayLike
-from jsmitsm.runtime.errors import explaining, short
+from jsmitsm.runtime.errors import TooCoarse, explaining, short
 from jsmitsm.runtime.progress import bar
 
 # A particle is on the boundary of a shape if it is nearer to it than this part of the whole domain.
@@ -294,7 +294,7 @@ def _check_gaps(sketch: _Sketch) -> None:
             near = near[np.min([other.distance(middle)[0] for other in sketch.shapes.values()], axis=0) > 0]
         if len(near):
             other = next(n for n, ids in sketch.on.items() if near[0] in ids)
-            raise ValueError(
+            raise TooCoarse(
                 f"shapes: a gap between {other!r} and {name!r} at {points[near[0]]}, thinner than the spacing; let "
                 "them touch exactly (the same function, the same vertices), or reduce the spacing"
             )
@@ -313,13 +313,13 @@ def _filled(sketch: _Sketch, seed: int, uniform: bool) -> dict[str, np.ndarray]:
     for name, shape in sketch.shapes.items():
         boundary = sketch.points[sketch.on[name]]
         if not len(boundary):
-            raise ValueError(f"shapes[{name!r}]: no boundary was found; is it empty? reduce the spacing")
+            raise TooCoarse(f"shapes[{name!r}]: no boundary was found; is it empty? reduce the spacing")
         if isinstance(shape, Interval):
             inside[name] = filling.divide(np.linspace(shape.lo, shape.hi, 2001), sketch.spacing)[0][1:-1]
         else:
             inside[name] = filling.fill(shape, sketch.spacing, shape.lo, shape.hi, boundary, seed, uniform)
         if not len(inside[name]):
-            raise ValueError(
+            raise TooCoarse(
                 f"shapes[{name!r}]: the region is too small for the spacing, no particle fits between those of its "
                 "boundary; reduce the spacing there (it may be a function of the position)"
             )

@@ -11,7 +11,7 @@ import numpy as np
 from jsmitsm.cloud.regions.region_cloud import sides
 from jsmitsm.discretization.coefficients import Numbers, numbers, slot_series
 from jsmitsm.discretization.held_particles import with_held_expansions
-from jsmitsm.discretization.layout import Class, table
+from jsmitsm.discretization.layout import Class, rounded_width, table
 from jsmitsm.discretization.least_squares import added_up
 from jsmitsm.discretization.leave_one_out import loads
 from jsmitsm.discretization.local_data import own_conditions, particles_first, right_sides, shared_elimination
@@ -166,7 +166,7 @@ def _joints(regions: Regions, nums: RegionNumbers, key: Any, found: list[Meeting
     part_names = [p.name for p in regions.parts]
     schemes = []
     for k, (n_own, lost) in zip(parts, own):
-        schemes.append(replace(regions.parts[k].disc.scheme, n_own=n_own, lost=lost, sourced=True))
+        schemes.append(replace(regions.parts[k].disc.scheme.with_own(n_own, lost), sourced=True))
     slots: dict[Any, None] = {}
     pairs, dropped = [], []
     for t, (name, keep) in enumerate(zip(names, kept)):
@@ -251,7 +251,8 @@ def _side_class(part: Part, scheme: Any, ids: np.ndarray) -> Class:
     own = np.searchsorted(part.ids, ids)
     near = np.asarray(part.disc.stencils.indices)[own]
     width = int(np.max(np.where(near >= 0, np.arange(near.shape[1]), 0), initial=0)) + 1
-    return Class(own, near[:, :width], scheme)
+    wide = rounded_width(width, 8)  # one program for joints of all pairs
+    return Class(own, np.pad(near[:, :wide], ((0, 0), (0, max(0, wide - near.shape[1]))), constant_values=-1), scheme)
 
 
 def between_numbers(regions: Regions, nums: RegionNumbers, made: Joints) -> tuple[Any, Any]:
