@@ -65,7 +65,7 @@ def measure(name: str, tol: float, most: int) -> dict[str, Any]:
         "history": {name: column.tolist() for name, column in found.history.items()},
         "said": found.messages + found.flags,
     }
-    return row | again(case, tol, most)
+    return row | (again(case, tol, most) if found.reached else {})  # who ends elsewhere is not raced
 
 
 def searched(case: Case, tol: float, most: int) -> js.Adapted:

@@ -12,7 +12,7 @@ from jsmitsm.adaptation.data import Data, data_of, unresolved
 from jsmitsm.adaptation.edges import edges
 from jsmitsm.adaptation.first_cloud import Make, farther_than_asked, made
 from jsmitsm.adaptation.free_ends import off_at_free_ends
-from jsmitsm.adaptation.layers import layers
+from jsmitsm.adaptation.layers import LOST, along_outflow, layers
 from jsmitsm.adaptation.marking import FAR, ROUGH, SLOW, Marks, marks, next_spacing
 from jsmitsm.adaptation.measure import Measured, Quantity, gaps, measured, size, spent
 from jsmitsm.adaptation.spacing_field import SpacingField
@@ -23,7 +23,7 @@ from jsmitsm.runtime.errors import SolveError, TooCoarse, TooFine
 from jsmitsm.solution.solution import Solution
 from jsmitsm.solution.solve import solve
 
-# Orders that may be used: two more are needed for the estimate, and two more for the estimate of the check.
+# Orders that may be used: two more are needed for the estimate, and two more for that of the check.
 ORDERS = tuple(range(1, 13))
 # With "auto": up to which tolerance an order serves, by dimension; while the error is rough, the first.
 _LADDER = {
@@ -349,6 +349,8 @@ class Rounds:
         better = self._better(spacing)
         if better is not None:
             field = better.joined(points, made_h)
+        if error > LOST:
+            field = along_outflow(self.data, self._cloud, field, self.max_particles // 4)
         for attempt in range(8):
             try:
                 following = self._cloud(field)

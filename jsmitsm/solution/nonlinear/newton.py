@@ -143,7 +143,29 @@ def _searched(record: Record, begin: Iterate, first: Iterate) -> Found:
             f"next one would still change u by {best.change:.1e} of its size; start nearer (u0), approach the "
             "parameters in stages (js.continuation), or refine the cloud"
         )
-    return judged(record.run, best)
+    return judged(record.run, released(record, best))
+
+
+def released(record: Record, found: Found) -> Found:
+    """Particles that were kept from moving settle once all others have, most often: from where the search ended, or
+    from expansions that its values alone tell. Fewer of them are kept then, or all is as it was."""
+    while found.good and len(found.frozen):
+        known = list(record.changes), record.rate
+        afresh = Iterate(*start(record.run.disc, record.run.problem, found.at.values)).numbers()
+        again = next((more for begin in (found.at, afresh) if (more := _with_fewer(record, begin, found))), None)
+        if again is None:
+            record.tried(found.at)  # what the run knows is of its last step
+            record.changes[:], record.rate = known
+            break
+        found = again
+    return found
+
+
+def _with_fewer(record: Record, begin: Iterate, found: Found) -> Found | None:
+    """Where damped steps from ``begin`` end, if fewer particles are kept from moving there."""
+    step = record.tried(begin)
+    again = None if step is None else damped(record, begin, step)
+    return again if again is not None and again.good and len(again.frozen) < len(found.frozen) else None
 
 
 def from_nearer(record: Record, best: Found, near: Iterate | None) -> Found:
