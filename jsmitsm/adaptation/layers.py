@@ -10,6 +10,7 @@ import numpy as np
 from jsmitsm.adaptation.data import Data
 from jsmitsm.adaptation.spacing_field import SpacingField
 from jsmitsm.cloud.cloud import Cloud
+from jsmitsm.runtime.errors import TooCoarse, TooFine
 
 # Spacing at the boundary, in decay lengths; a spacing that is not larger than this many needs no help.
 _FINE = 1.0
@@ -53,12 +54,17 @@ def along_outflow(data: Data | None, make: Callable[[Any], Cloud], field: Spacin
     """The spacing, as fine along all of a boundary as the layer is that convection makes there.
 
     Until such a layer is resolved everywhere, nothing upstream of it is right. Left as it is where that takes more
-    than ``most`` particles.
+    than ``most`` particles, or a cloud that cannot be made.
     """
+    if data is None or not any(sum(b) == 1 for _, b in data.traced.slots):
+        return field
     finer = field
     for _ in range(_TIMES):
-        cloud = make(finer)
-        if data is None or len(cloud) > most:
+        try:
+            cloud = make(finer)
+        except (TooCoarse, TooFine):
+            return field
+        if len(cloud) > most:
             return field
         at, thin = layers(data, cloud, finer(np.asarray(cloud.points)), outflow=True)
         if not len(at):
