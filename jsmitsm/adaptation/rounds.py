@@ -42,10 +42,9 @@ _PARTLY = 2.0
 _AIMED = 0.6
 # The numbers of two rounds may differ by so many times what the first was thought to be off by.
 _AGREE = 3.0
-# Where they part, at a corner most often, that falls with this power of the spacing.
-_PARTED = 0.5
-# Where they part by so many times what they may, that is known to be the point, and worth more than a round.
-_TORN = 30.0
+# Where they part, at a corner most often, that falls with this power of the spacing; by so many times what they may,
+# that is known to be the point, and worth more than a round.
+_PARTED, _TORN = 0.5, 30.0
 # While only that is wanting, the error at the particles may go back to so many of the usual aims.
 _EASED = 1.5
 # A cloud of this part of the particles that are allowed is the last.
@@ -210,7 +209,8 @@ class Rounds:
         if not self.rows or self.rows[-1][2] > ROUGH:
             wanted = min(wanted, ladder[0][1])
         last = self.rows[-1] if self.rows else (0, 0, 0.0, 0.0, 0.0)
-        if self.lowered is not None and last[1] < self.lowered[0] and last[2] > self.lowered[1]:
+        # Lower orders were no remedy, or the solution is rough no more.
+        if self.lowered is not None and last[1] < self.lowered[0] and not _HOPE * ROUGH <= last[2] <= self.lowered[1]:
             self.highest, self.shallow, self.hopeful = self.lowered[0], False, True
         elif len(self.rows) > 1 and last[2] > max(ROUGH, _HOPE * self.rows[-2][2]) and not self.hopeful:
             # More particles do not help: Taylor series of something that is not smooth. First the depth is too much.

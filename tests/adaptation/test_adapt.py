@@ -417,6 +417,17 @@ def test_a_lower_order_that_does_worse_is_given_up():
     assert search._order(cloud) == 4
 
 
+def test_a_lower_order_is_left_where_nothing_is_rough_any_more():
+    """A spike at a vertex of which the first clouds saw nothing ended at order 2, far from its tolerance."""
+    search, cloud = a_search(), js.interval(0.0, 1.0, 11)
+    search.rows, search.least, search.shallow = [(20, 4, 1.6, 0.0, 0.1), (40, 4, 1.5, 0.0, 0.1)], 2, True
+    assert search._order(cloud) == 2
+    search.rows.append((80, 2, 0.2, 0.0, 0.1))
+    assert search._order(cloud) == 2
+    search.rows.append((160, 2, 0.1, 0.0, 0.1))
+    assert search._order(cloud) == 4 and not search.shallow
+
+
 def test_numbers_that_move_more_than_was_thought_are_not_believed():
     """A change of 0.03 after an error of 0.001 was estimated: all but three times that was foreseen by nobody."""
     search = a_search()
