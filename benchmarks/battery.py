@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jsmitsm as js
+from benchmarks.commandline import arguments
 
 DATA = Path(__file__).parent / "data" / "battery.json"
 X = (0.0, 6.1, 6.5, 8.0, 8.4)
@@ -154,4 +155,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    arguments(__doc__)
     main()
