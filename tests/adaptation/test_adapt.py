@@ -14,7 +14,7 @@ from jsmitsm.adaptation.data import data_of, unresolved
 from jsmitsm.adaptation.edges import edges
 from jsmitsm.adaptation.first_cloud import first_cloud
 from jsmitsm.adaptation.free_ends import off_at_free_ends
-from jsmitsm.adaptation.layers import layers
+from jsmitsm.adaptation.layers import along_outflow, layers
 from jsmitsm.adaptation.marking import Marks, marks, next_spacing
 from jsmitsm.adaptation.measure import Measured
 from jsmitsm.adaptation.rounds import Rounds
@@ -187,6 +187,22 @@ def test_outflow_has_a_layer_and_inflow_none():
     at, spacing = layers(data_of(problem, 1, 4), js.interval(0.0, 1.0, 11), np.full(11, 0.1))
     assert at.tolist() == [[1.0]]
     assert spacing == pytest.approx([1e-3])
+
+
+def test_a_layer_of_convection_is_followed_along_its_whole_boundary():
+    """Its width is 1e-2; along the sides that the wind blows past, and where it comes in, nothing is refined."""
+    square = lambda spacing: js.from_polygon(SQUARE, spacing)
+    wind = js.Problem(lambda u, x: 1e-2 * js.laplacian(u)(x) - js.grad(u)(x)[0] + 1.0, {"boundary": js.dirichlet(0.0)})
+    points, data = np.asarray(square(0.1).points), data_of(wind, 2, 4)
+    field = SpacingField(points, np.full(len(points), 0.1), 1.0)
+    # At the corners normals are halfway to the sides, and halfway between two particles the spacing may have grown.
+    followed, y = along_outflow(data, square, field, 5000), np.linspace(0.05, 0.95, 41)
+    assert followed(np.stack([np.ones(41), y], axis=1)).max() <= (1.0 + GROWTH / 2.0) * 1e-2
+    assert field(np.stack([np.ones(41), y], axis=1)).min() >= 0.099
+    assert followed(np.stack([np.zeros(41), y], axis=1)).min() >= 0.099
+    assert along_outflow(data, square, field, 300) is field  # too many particles
+    still = js.Problem(lambda u, x: 1e-4 * js.laplacian(u)(x) - u(x) + 1.0, {"boundary": js.dirichlet(0.0)})
+    assert along_outflow(data_of(still, 2, 4), square, field, 5000) is field
 
 
 def test_a_search_begins_finer_where_a_region_is_thinner_than_its_first_spacing():
