@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jsmitsm.equation.elements import Elements
 from jsmitsm.equation.field import Field, LocalField, field_p, frozen_p
-from jsmitsm.equation.folding import folded
 from jsmitsm.equation.marks import DIFFERENTIATED
 from jsmitsm.equation.unknowns.parts import parts
 from jsmitsm.runtime.jaxprs import (
@@ -129,9 +129,8 @@ def open_fields(jaxpr: Any, consts: Sequence[Any], args: Sequence[Any], slots: d
 
     Equal operations are performed once: nested derivatives repeat the same values many times.
     """
-    done: dict[Any, list[Any]] = {}
 
-    def walk(jaxpr: Any, consts: Sequence[Any], args: Sequence[Any], share: bool) -> list[Any]:
+    def walk(jaxpr: Any, consts: Sequence[Any], args: Sequence[Any], perform: Elements) -> list[Any]:
         env = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*consts, *args], strict=True))
 
         def read(v: Any) -> Any:
@@ -145,18 +144,19 @@ def open_fields(jaxpr: Any, consts: Sequence[Any], args: Sequence[Any], slots: d
             elif eqn.primitive is frozen_p or is_mark(eqn):
                 out = vals
             elif inner is not None:
-                out = walk(inner.jaxpr, inner.consts, vals[len(vals) - len(inner.jaxpr.invars) :], share)
+                out = walk(inner.jaxpr, inner.consts, vals[len(vals) - len(inner.jaxpr.invars) :], perform)
             elif any(slots_of(j) for j in inner_jaxprs(eqn)):
-                out = control(eqn, vals, lambda j, c, a: walk(j, c, a, False))
+                out = control(eqn, [perform.whole(v) for v in vals], performed)
             else:
-                key = _key(eqn, vals) if share else None
-                out = done[key] if key in done else bind(eqn, *vals)
-                if key is not None:
-                    done[key] = out
+                out = perform(eqn, vals)
             env.update(zip(eqn.outvars, out, strict=True))
         return [read(v) for v in jaxpr.outvars]
 
-    return walk(jaxpr, consts, args, True)
+    def performed(jaxpr: Any, consts: Sequence[Any], args: Sequence[Any]) -> list[Any]:
+        perform = Elements()
+        return [perform.whole(v) for v in walk(jaxpr, consts, args, perform)]
+
+    return performed(jaxpr, consts, args)
 
 
 def control(eqn: Any, vals: list[Any], walk: Callable[..., list[Any]]) -> list[Any]:
@@ -187,17 +187,6 @@ def control(eqn: Any, vals: list[Any], walk: Callable[..., list[Any]]) -> list[A
         lambda state: walk(body.jaxpr, body.consts, [*vals[n:n + m], *state]),
         vals[n + m:],
     ))  # fmt: skip
-
-
-def _key(eqn: Any, vals: list[Any]) -> Any:
-    """What an operation computes, or None where that cannot be compared."""
-    try:
-        params = tuple(sorted(eqn.params.items()))
-        hash(params)
-    except TypeError:
-        return None
-    operands = tuple((v.dtype.str, v.item()) if isinstance(v, np.ndarray) and v.ndim == 0 else id(v) for v in vals)
-    return eqn.primitive, params, operands, tuple(v.aval.shape for v in eqn.outvars)
 
 
 def tangents_of(
@@ -358,7 +347,7 @@ def record(
     # The constants of the first trace are the last inputs of the third; make them constants again.
     made = program(third, last=len(flat.constvars))
     kept = tuple(map(owned, (*third.consts, *first.consts)))  # the user may change the arrays in place
-    return Record(folded(made), kept, ordered, tuple(outputs), flat.outvars[0].aval.shape[0], flat)
+    return Record(made, kept, ordered, tuple(outputs), flat.outvars[0].aval.shape[0], flat)
 
 
 def _shaped(v: Any) -> jax.ShapeDtypeStruct:
