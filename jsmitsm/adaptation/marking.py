@@ -37,6 +37,11 @@ _REACH, _AFFECTED = 4.0, 25.0
 _POINT = 0.5
 # Of a line of them there are at least so many within so many spacings.
 _ALONG, _FEW = 12.0, 5
+# From one of many there are others as bad (in parts of it) at distances between these, in its spacings; around a lone one
+# there are none.
+_AS_BAD, _FROM, _TO = 0.1, 6.0, 15.0
+# So many particles of a line are looked at together.
+_LINED = 48
 # Within so many spacings a singular point is the one of the round before.
 _SAME = 1.0
 # The error is at least the largest contribution, and random signs of many add up to this part of their root sum
@@ -50,7 +55,7 @@ Gathered = Callable[[np.ndarray], float]
 
 class Marks(NamedTuple):
     """What a round leaves for the next: where (N, D), the spacing, contributions, the rates at which they fall, and
-    whether it is a point that smoothness ends at, and known to be this one, all (N,)."""
+    whether smoothness ends there, and that at a point which is known to be this one, or along a line, all (N,)."""
 
     points: np.ndarray
     spacing: np.ndarray
@@ -58,6 +63,7 @@ class Marks(NamedTuple):
     rate: np.ndarray
     singular: np.ndarray
     located: np.ndarray
+    along: np.ndarray
 
 
 def marks(
@@ -88,8 +94,10 @@ def marks(
         rate = np.where(fresh, power, np.nanmedian(around, axis=1))
     worst = (contribution > 0) & (contribution >= contribution[near].max(axis=1)) & (rate < min(SLOW, _ROUGH * power))
     at = _middle(contribution[near], away / spacing[:, None], near, edge)[worst]
-    at = _where_known(points, spacing, at, before)
+    at, along = _where_known(points, spacing, at, before), np.zeros(len(points), bool)
     np.minimum.at(rate, at, rate[worst])
+    if before is not None:
+        at, along = _on_lines(points, spacing, largest, rate < min(SLOW, _ROUGH * power), np.unique(at), before)
     if before is None and edge is not None:
         # No rates yet: what stands out at an edge is taken for its end of smoothness, and one round more tells.
         stark = contribution >= _STARK * max(float(np.median(contribution)), 1e-300)
@@ -101,7 +109,8 @@ def marks(
         sure = _lone(points, spacing, np.unique(tree.query(poles)[1]))
     rate[sure] = np.minimum(rate[sure], _SUSPECTED)
     singular, located = _singular(points, spacing, np.unique(at), before, sure)
-    return Marks(points, spacing, largest, np.clip(rate, _SLOWEST, power), singular, located)
+    _evened(points, along, largest, rate)
+    return Marks(points, spacing, largest, np.clip(rate, _SLOWEST, power), singular | along, located, along)
 
 
 def _middle(contribution: np.ndarray, away: np.ndarray, near: np.ndarray, edge: np.ndarray | None) -> np.ndarray:
@@ -128,6 +137,39 @@ def _where_known(points: np.ndarray, spacing: np.ndarray, at: np.ndarray, before
     return np.where(beside, there[which], at)
 
 
+def _on_lines(
+    points: np.ndarray, spacing: np.ndarray, contribution: np.ndarray, slow: np.ndarray, at: np.ndarray, before: Marks
+) -> tuple[np.ndarray, np.ndarray]:
+    """Those of the particles ``at`` that are points where smoothness ends, and the particles (N,) along lines of such.
+
+    slow (N,): those whose contributions fall slowly. What was found at the same point twice is one.
+    """
+    along = np.zeros(len(points), bool)
+    if not len(at):
+        return at, along
+    some = slow & (contribution >= _AS_BAD * contribution[at].max())
+    others = cKDTree(points[some])
+    count = lambda far: others.query_ball_point(points[at], far * spacing[at], return_length=True)  # noqa: E731
+    lines = count(_TO) - count(_FROM) >= _FEW
+    lines |= before.along[cKDTree(before.points).query(points[at])[1]]
+    if before.located.any():
+        lines &= cKDTree(before.points[before.located]).query(points[at])[0] > _SAME * spacing[at]
+    if lines.any():
+        alone = np.zeros(len(points), bool)
+        alone[at[~lines]] = True
+        along = some & ~alone & ~_reached(points, spacing, alone, _AFFECTED)
+    return at[~lines], along
+
+
+def _evened(points: np.ndarray, along: np.ndarray, contribution: np.ndarray, rate: np.ndarray) -> None:
+    """Contributions and rates along lines made alike: they differ by chance, from one particle to the next."""
+    at = points[along]
+    if len(at):
+        near = cKDTree(at).query(at, k=range(1, min(_LINED, len(at)) + 1))[1]
+        contribution[along] = contribution[along][near].max(axis=1)
+        rate[along] = np.median(rate[along][near], axis=1)
+
+
 def _singular(
     points: np.ndarray, spacing: np.ndarray, at: np.ndarray, before: Marks | None, sure: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -135,8 +177,9 @@ def _singular(
     the same point twice (N,)."""
     singular, located = np.zeros((2, len(points)), bool)
     singular[at] = True
-    if before is not None and before.singular.any() and singular.any():
-        located[at] = cKDTree(before.points[before.singular]).query(points[at])[0] <= _SAME * spacing[at]
+    known = None if before is None else before.points[before.singular & ~before.along]
+    if known is not None and len(known) and len(at):
+        located[at] = cKDTree(known).query(points[at])[0] <= _SAME * spacing[at]
     singular[sure] = located[sure] = True
     singular &= located | ~_reached(points, spacing, located, _AFFECTED)
     return singular, located

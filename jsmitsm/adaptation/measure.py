@@ -10,11 +10,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jsmitsm.particle.polynomials import monomials_on_host
 from jsmitsm.runtime.errors import SolveError, in_words
 from jsmitsm.solution.estimate import Correction
 from jsmitsm.solution.solution import Solution
-from jsmitsm.taylor.multi_indices import multi_indices
 
 NORMS = ("max", "l2")
 Quantity = Callable[[Solution], Any]
@@ -110,28 +108,6 @@ def size(error: np.ndarray, values: np.ndarray, spacing: np.ndarray, norm: str, 
         volume = spacing[:, None] ** dim
         part, whole = (np.sqrt(np.mean((x / largest) ** 2 * volume)) for x in (error, values))
     return float(part / whole) if whole > 0 else float(part)
-
-
-def gaps(sol: Solution) -> np.ndarray | None:
-    """By how much the polynomials of neighbours differ halfway between them (N,); None where they cannot be had.
-
-    What happens within a spacing, unseen by the particles, parts them: a layer at a wall, for instance.
-    """
-    try:
-        found = np.asarray(sol.coefficients, float)
-    except (ValueError, SolveError):
-        return None  # a source that is infinite on the boundary
-    found = found.reshape(*found.shape[:2], -1)
-    points, dim = np.asarray(sol.cloud.points), sol.cloud.dim
-    near = sol.neighbours[:, 1 : 2 * dim + 1]  # those across a slit are none
-    near = np.where((near >= 0) & (near < len(points)), near, np.arange(len(points))[:, None])
-    odd = np.array([(-1.0) ** sum(a) for a in multi_indices(dim, sol.order + sol.depth)])
-    worst = np.zeros(len(points))
-    for k in range(near.shape[1]):
-        powers = monomials_on_host(0.5 * (points[near[:, k]] - points).T, sol.order + sol.depth).T
-        apart = np.einsum("nk,nkf->nf", powers, found) - np.einsum("nk,nkf->nf", odd * powers, found[near[:, k]])
-        worst = np.maximum(worst, np.abs(apart).max(axis=1))
-    return worst if np.isfinite(worst).all() else None
 
 
 def _weights(sol: Solution, quantity: Quantity) -> tuple[float, np.ndarray | None]:

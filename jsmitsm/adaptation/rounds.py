@@ -14,12 +14,13 @@ from jsmitsm.adaptation.first_cloud import Make, farther_than_asked, made
 from jsmitsm.adaptation.free_ends import off_at_free_ends
 from jsmitsm.adaptation.layers import LOST, along_outflow, layers
 from jsmitsm.adaptation.marking import FAR, ROUGH, SLOW, Marks, marks, next_spacing
-from jsmitsm.adaptation.measure import Measured, Quantity, gaps, measured, size, spent
+from jsmitsm.adaptation.measure import Measured, Quantity, measured, size, spent
 from jsmitsm.adaptation.spacing_field import SpacingField
 from jsmitsm.adaptation.witness import Earlier, doubted, remembered, stands_out, unseen
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.equation.problem import Problem
 from jsmitsm.runtime.errors import SolveError, TooCoarse, TooFine
+from jsmitsm.solution.look.gaps import gaps
 from jsmitsm.solution.solution import Solution
 from jsmitsm.solution.solve import solve
 
@@ -31,6 +32,8 @@ _LADDER = {
     2: ((2e-3, 4), (1e-5, 6), (0.0, 8)),
     3: ((1e-3, 4), (0.0, 6)),
 }
+# Where smoothness ends along lines with so large a part of the particles, a higher order makes them dearer, no fewer.
+_LINES = 0.3
 # A rough solution that a round leaves with this part of its error gets no better by particles.
 _HOPE = 0.5
 # Polynomials of neighbours may differ between them by so many tolerances: they are off by so much more than the values.
@@ -98,6 +101,7 @@ class Rounds:
         self.apart: np.ndarray | None = None  # gaps between neighbours, where they are what is wrong
         self.least_error: Ended | None = None
         self.lowered: tuple[int, float] | None = None  # order and error before the order was lowered
+        self.lined = False  # whether smoothness ends along lines that hold most particles, whatever the order
         self.hopeful = False  # whether that was no remedy, and more particles are what is left
 
     def history(self) -> dict[str, np.ndarray]:
@@ -206,7 +210,7 @@ class Rounds:
             return int(self.wanted_order)
         ladder = _LADDER[cloud.dim]
         wanted = next(order for limit, order in ladder if self.tol >= limit)
-        if not self.rows or self.rows[-1][2] > ROUGH:
+        if not self.rows or self.rows[-1][2] > ROUGH or self.lined:
             wanted = min(wanted, ladder[0][1])
         last = self.rows[-1] if self.rows else (0, 0, 0.0, 0.0, 0.0)
         # Lower orders were no remedy, or the solution is rough no more.
@@ -331,6 +335,7 @@ class Rounds:
         least = growth.least(len(cloud), int(self.max_particles / 1.1))
         here = self._marks(found, cloud, spacing)
         self.before = here if np.isfinite(found.error) else None
+        self.lined |= here.along.mean() > _LINES
         if len(cloud) >= _FULL * self.max_particles:
             self._limit(f"the {self.max_particles} particles that were allowed (max_particles)")
             return None

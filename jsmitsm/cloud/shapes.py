@@ -12,7 +12,7 @@ from jsmitsm.cloud.cloud import INTERIOR, Cloud
 from jsmitsm.cloud.filling import SpacingLike
 from jsmitsm.cloud.packing.octree import Region, Spacing
 from jsmitsm.runtime.arrays import ArrayLike
-from jsmitsm.runtime.errors import explaining, is_whole, numbers, short
+from jsmitsm.runtime.errors import TooCoarse, explaining, is_whole, numbers, short
 from jsmitsm.runtime.progress import bar
 
 # The cosine of 5 degrees: boundary particles whose normals differ by more may stand on two sides of a corner.
@@ -179,7 +179,7 @@ def _cloud(
     """Fill the interior and put everything together."""
     inside = filling.fill(region, spacing, lo, hi, boundary.points, seed, uniform)
     if not len(inside):
-        raise ValueError(
+        raise TooCoarse(
             "spacing: too coarse for the shape, no interior particle fits half a spacing away from its "
             f"{len(boundary.points)} boundary particles; reduce it well below the width of the shape"
         )

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm.cloud.cloud import INTERIOR, Cloud
+from jsmitsm.cloud.corners import side_normals
 from jsmitsm.equation.bcs import Condition
 from jsmitsm.equation.closing import recorded_residual, recorded_values
 from jsmitsm.equation.problem import Problem
@@ -218,7 +219,7 @@ def _held_by_residual(group: Group, problem: Problem) -> None:
 def _normals(cloud: Cloud, ids: np.ndarray, where: str) -> Any:
     if cloud.normals is None:
         raise ValueError(f"{where}: the condition uses the normal, but the cloud has none; give Cloud(..., normals=)")
-    normals = picked(cloud.normals, ids)
+    normals = picked(side_normals(cloud), ids)
     if not is_traced(normals) and np.isnan(np.asarray(normals)).any():
         raise ValueError(f"{where}: NaN normals in this group; give every boundary particle a unit outward normal")
     return normals

@@ -1,16 +1,24 @@
-"""Errors of eigenvalues, by the pencil of order p + 2: what it makes of the values by way of both vectors."""
+"""Errors of eigenvalues: by the pencil of order p + 2, by way of both vectors, and by what no order sees."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
+from jsmitsm.discretization.layout import Discretization
 from jsmitsm.discretization.pencil.assemble import Pencil
+from jsmitsm.discretization.regions.layout import Regions
+from jsmitsm.discretization.resolution.residuals import residual
 from jsmitsm.modes.question import Question, assembled, reduced
 from jsmitsm.modes.spectrum import Pairs
 from jsmitsm.runtime.errors import SolveError
 from jsmitsm.runtime.progress import PENCIL, bar
+from jsmitsm.solution.look.between import same_everywhere
+from jsmitsm.solution.look.gaps import gaps
+from jsmitsm.solution.look.halfway import WAYS, around
+from jsmitsm.solution.solution import Solution
 from jsmitsm.taylor.multi_indices import HIGHEST
 
 # Rows of two orders differ in the weight of their source by less than this.
@@ -44,6 +52,47 @@ def errors(question: Question, found: Pairs) -> np.ndarray:
         at = np.flatnonzero(found.cluster == cluster)
         out[at] = np.linalg.norm(moved[np.ix_(at, at)], 2)
     return out
+
+
+def unseen(question: Question, found: Pairs, mode: Callable[[int], Solution]) -> np.ndarray:
+    """By how much values (k,) may be off for what rows of all orders miss alike, in one region.
+
+    mode: those between the particles, which solve L u - lambda mass u = 0. Halfway to their neighbours polynomials miss
+    it by r where a coefficient or the mass jumps, which moves the value by
+
+        y^T B r / y^T C v,
+
+    and where the mode is not smooth, at a corner or where conditions change, neighbours part by a gap there. The value
+    is off by about its square (in parts of the largest |v|; measured on corners and changes of conditions, by 0.2 to 4
+    times that), as energies are: what two orders tell falls with another power of the spacing.
+    """
+    out, pencil = np.zeros(len(found.values)), question.pencil
+    if isinstance(pencil.layout.disc, Regions):
+        return out
+    for k in np.flatnonzero(np.isreal(found.values)):
+        sol, value = mode(int(k)), abs(found.values[k])
+        disc, values = sol._fit.discretization(), np.asarray(sol.u).reshape(len(sol.cloud), -1)
+        parted, largest = gaps(sol), float(np.abs(values).max(initial=0.0))
+        if parted is not None and max(disc.rec.orders) == 2 and largest > 0:
+            out[k] = value * (float(parted.max(initial=0.0)) / largest) ** 2
+        if not same_everywhere(disc):
+            missed = np.abs(found.left[:, k] @ (pencil.B.host @ _left_between(sol, disc))[pencil.free])
+            out[k] = max(out[k], missed / np.abs(found.left[:, k] @ (question.inert.host @ values.ravel()[pencil.free])))
+    for cluster in np.unique(found.cluster):
+        at = found.cluster == cluster
+        out[at] = out[at].max()
+    return out
+
+
+def _left_between(sol: Solution, disc: Discretization) -> np.ndarray:
+    """What polynomials leave of the equation halfway to their neighbours, at the particles (N F,)."""
+    fitted = np.asarray(sol.coefficients, float).reshape(len(sol.cloud), disc.rec.fields, -1)
+    fitted = np.concatenate([fitted, fitted[disc.images.owner]])
+    left = lambda ids, there, offset: residual(disc, sol._fit.problem, there, offset, fitted[ids])
+    ids, mean = around(disc, disc.classes, left, WAYS[disc.rec.dim])
+    rest = np.zeros((len(sol.cloud), disc.rec.fields))
+    rest[ids] = mean.T
+    return rest.ravel()
 
 
 def _other_order(question: Question) -> Pencil | None:

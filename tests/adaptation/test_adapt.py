@@ -1,6 +1,8 @@
 """A tolerance in, an answer out: what is reached is so, what is not is said."""
 
+import re
 from dataclasses import replace
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -224,6 +226,25 @@ def test_a_search_begins_finer_where_a_region_is_thinner_than_its_first_spacing(
     assert np.abs(found.solution(at) - fine(at)).max() < 3e-3 * np.abs(fine.u).max()
 
 
+@pytest.mark.parametrize(("long", "high"), [(3.0, 0.5), (5.0, 1.0), (40.0, 1.0), (1.0, 0.02)])
+def test_the_first_cloud_suits_slender_shapes(long, high):
+    strip = [(0, 0), (long, 0), (long, high), (0, high)]
+    bounds = ((0, 0), (long, high))
+    for make in (
+        lambda spacing: js.from_polygon(strip, spacing),
+        lambda spacing: js.from_sdf(js.sdf.rectangle(*bounds), bounds, spacing),
+    ):
+        cloud, spacing = first_cloud(make, None)
+        assert len(cloud.groups["interior"]) > 0 and spacing.largest_used < high
+
+
+def test_every_refusal_of_a_coarse_spacing_is_one_of_its_kind():
+    """Searches go on after a ``TooCoarse``, and not after any other ``ValueError``."""
+    for path in Path(js.__file__).parent.rglob("*.py"):
+        for refusal in re.findall(r"raise ValueError\([^)]*too coarse[^)]*", path.read_text()):
+            raise AssertionError(f"{path.name}: {refusal}")
+
+
 def test_the_first_cloud_suits_any_size_of_domain():
     for size in (1e-3, 1.0, 1e4):
         cloud, _ = first_cloud(lambda spacing: js.from_polygon(np.multiply(SQUARE, size), spacing), None)  # noqa: B023
@@ -247,7 +268,7 @@ def test_a_spacing_field_grows_no_faster_than_it_may():
 
 def marked(points, eta):
     none = np.zeros(len(points), bool)
-    return Marks(points, np.full(len(points), 0.01), eta, np.full(len(points), 5.0), none, none)
+    return Marks(points, np.full(len(points), 0.01), eta, np.full(len(points), 5.0), none, none, none)
 
 
 def test_contributions_are_made_equal():
@@ -391,7 +412,7 @@ def test_rounds_of_two_orders_tell_no_rates():
     search.solution = js.solve(GOOD, cloud, order=4)
     x, none = np.asarray(cloud.points), np.zeros(101, bool)
     found, field = Measured(3e-4, np.full(101, 0.5), 1.0), SpacingField(x, np.full(101, 0.01), 0.01)
-    search.before = Marks(x, np.full(101, 0.02), np.ones(101), np.full(101, 5.0), none, none)
+    search.before = Marks(x, np.full(101, 0.02), np.ones(101), np.full(101, 5.0), none, none, none)
     for orders, rate in (((4, 4), 1.0), ((2, 4), search._power(cloud))):
         search.rows = [(101, order, 1e-2, 0.0, 0.02) for order in orders]
         assert np.median(search._marks(found, cloud, field).rate) == pytest.approx(rate)
@@ -472,7 +493,7 @@ def test_where_smoothness_ends_the_estimate_is_half_of_the_error():
     assert doubted(found) == 0.0  # nobody knows a rate yet
     none = np.zeros(101, bool)
     search.rows = [(101, 4, 1e-2, 0.0, 0.02), (101, 4, 3e-4, 0.0, 0.01)]
-    search.before = Marks(x, np.full(101, 0.02), np.ones(101), np.full(101, 5.0), none, none)
+    search.before = Marks(x, np.full(101, 0.02), np.ones(101), np.full(101, 5.0), none, none, none)
     assert doubted(found) == pytest.approx(4e-4)
     # Of a source that is infinite there, what is seen between the particles is such a part too.
     missed = np.where(x[:, 0] < 0.05, 5e-4, 0.0)

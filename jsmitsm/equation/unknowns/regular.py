@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm.cloud.cloud import Cloud
+from jsmitsm.cloud.corners import side_normals
 from jsmitsm.cloud.regions.region_cloud import RegionCloud, sides
 from jsmitsm.equation.bcs import Condition
 from jsmitsm.equation.conditions import component
@@ -240,7 +241,7 @@ def _regular(
         return Condition(c.kind, c.field, **rest, value=sampled("value") - there)
     if cloud.normals is None:
         return c  # refused by name later
-    slope = of_singular(lambda singular, x, n: jax.jvp(singular.at, (x,), (n,))[1], jnp.asarray(cloud.normals)[ids])
+    slope = of_singular(lambda singular, x, n: jax.jvp(singular.at, (x,), (n,))[1], jnp.asarray(side_normals(cloud))[ids])
     if c.kind == "neumann":
         return Condition(c.kind, c.field, value=sampled("value") - slope)
     a, b = sampled("a"), sampled("b")

@@ -1,0 +1,105 @@
+"""Conditions at corners within a group hold for a side, and not along the bisector."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jsmitsm as js
+from jsmitsm.cloud.corners import side_normals
+
+SQUARE = [(-1, -1), (1, -1), (1, 1), (-1, 1)]
+SHAPES = {
+    "square": lambda: js.from_polygon(SQUARE, 0.2),
+    "ell": lambda: js.from_polygon([(0, 0), (2, 0), (2, 1), (1, 1), (1, 2), (0, 2)], 0.2),
+    "triangle far away": lambda: js.from_polygon([(1e4, 1e4), (1e4 + 2, 1e4 + 0.3), (1e4 + 0.7, 1e4 + 1.5)], 0.2),
+    "rectangle": lambda: js.from_sdf(js.sdf.rectangle((0, 0), (2, 1)), ((0, 0), (2, 1)), 0.15),
+    "half disk": lambda: js.from_sdf(
+        js.sdf.intersection(js.sdf.circle((0, 0), 1.0), js.sdf.rectangle((-2, 0), (2, 2))), ((-1, 0), (1, 1)), 0.15
+    ),
+    "cube": lambda: js.from_sdf(js.sdf.box((0, 0, 0), (1, 1, 1)), ((0, 0, 0), (1, 1, 1)), 0.25),
+    "cylinder": lambda: js.from_sdf(js.sdf.cylinder((0, 0, 0), (0, 0, 1), 0.5), ((-1, -1, 0), (1, 1, 1)), 0.22),
+}
+
+
+def quadratic(x):
+    return x @ x + 3.0 * x[0] * x[1] - x[-1]
+
+
+@pytest.mark.parametrize("name", SHAPES)
+@pytest.mark.parametrize("kind", ["robin", "condition"])
+def test_slopes_along_a_side_hold_to_its_end(name, kind):
+    """The slope of a quadratic along the normal of every side, told without those of the corners themselves."""
+    cloud = SHAPES[name]()
+    slope = lambda x, n: quadratic(x) + jax.grad(quadratic)(x) @ n
+    if kind == "condition":
+        bc = js.condition(lambda u, x, n: u(x) + js.grad(u)(x) @ n - slope(x, n))
+    else:
+        ids = np.asarray(cloud.groups["boundary"])
+        bc = js.robin(1.0, 1.0, np.asarray(jax.vmap(slope)(cloud.points[ids], np.asarray(side_normals(cloud))[ids])))
+    origin = jnp.asarray(cloud.points).mean(0)
+    exact = np.asarray(jax.vmap(quadratic)(cloud.points))
+    sol = js.solve(js.Problem(lambda u, x: js.laplacian(u)(x) - 2 * cloud.dim, {"boundary": bc}), cloud)
+    assert np.abs(sol.u - exact).max() < 1e-11 * max(np.abs(exact).max(), float(origin @ origin))
+    assert not sol.flags
+
+
+def test_one_group_is_as_good_as_four():
+    """Cooled all around, which nobody splits into sides: the same as with a group for every side."""
+    sides = {"south": lambda x: x[:, 1] < -1 + 1e-9, "north": lambda x: x[:, 1] > 1 - 1e-9,
+             "west": lambda x: x[:, 0] < -1 + 1e-9, "east": lambda x: x[:, 0] > 1 - 1e-9}  # fmt: skip
+    pde, cooled = lambda u, x: js.laplacian(u)(x) + 1.0, js.robin(1.0, 1.0, 0.0)
+    one, four = js.from_polygon(SQUARE, 0.1), js.from_polygon(SQUARE, 0.1, groups=sides)
+    sol = js.solve(js.Problem(pde, {"boundary": cooled}), one, order=6)
+    split = js.solve(js.Problem(pde, dict.fromkeys(sides, cooled)), four, order=6)
+    assert np.abs(sol.u - split(one.points)).max() < 1e-6  # along bisectors: 0.02
+
+
+def test_fluxes_that_balance_are_not_refused():
+    problem = js.Problem(lambda u, x: js.laplacian(u)(x) - 2.0, {"boundary": js.neumann(1.0)})
+    cloud = js.from_polygon(SQUARE, 0.2)
+    sol = js.solve(problem, cloud)
+    off = sol.u - 0.5 * (cloud.points**2).sum(axis=1)
+    assert np.ptp(off) < 1e-12
+
+
+def test_smooth_boundaries_keep_their_normals():
+    """Tips of ellipses that few particles see, and straight sides that end in arcs, have no corners."""
+    ellipse = js.from_sdf(lambda x: jnp.hypot(x[0] / 2, x[1] / 0.3) - 1, ((-2.2, -0.5), (2.2, 0.5)), 0.15)
+    stadium = js.from_sdf(js.sdf.capsule((-1, 0), (1, 0), 0.5), ((-2, -1), (2, 1)), 0.12)
+    lens = js.from_sdf(
+        js.sdf.intersection(js.sdf.circle((-0.5, 0), 1.0), js.sdf.circle((0.5, 0), 1.0)), ((-1, -1), (1, 1)), 0.1
+    )
+    ball = js.from_sdf(js.sdf.sphere((0, 0, 0), 1.0), ((-1,) * 3, (1,) * 3), 0.3)
+    for cloud in (ellipse, stadium, lens, ball, js.interval(0, 1, 9), js.rectangle((0, 0), (1, 1), (6, 6))):
+        assert side_normals(cloud) is cloud.normals
+
+
+def test_the_sides_of_a_cube_are_those_of_its_faces():
+    found = side_normals(SHAPES["cube"]())
+    at = np.isfinite(found[:, 0])
+    assert np.allclose(np.abs(found[at]).max(axis=1), 1.0)
+
+
+def test_it_does_not_matter_how_particles_are_numbered():
+    cloud = SHAPES["ell"]()
+    new = np.random.default_rng(0).permutation(len(cloud))
+    place = np.argsort(new)
+    other = js.Cloud(cloud.points[new], {n: place[ids] for n, ids in cloud.groups.items()}, cloud.normals[new])
+    assert np.array_equal(side_normals(cloud)[new], side_normals(other), equal_nan=True)
+
+
+def test_derivatives_by_the_normals_are_those_of_the_side():
+    cloud = js.from_polygon(SQUARE, 0.4)
+
+    def mean(turn):
+        n = jnp.nan_to_num(cloud.normals)
+        turned = jnp.stack([n[:, 0] * jnp.cos(turn) - n[:, 1] * jnp.sin(turn),
+                            n[:, 0] * jnp.sin(turn) + n[:, 1] * jnp.cos(turn)], axis=1)  # fmt: skip
+        moved = cloud.replace(normals=jnp.where(jnp.isnan(cloud.normals), jnp.nan, turned))
+        problem = js.Problem(lambda u, x: js.laplacian(u)(x) + x[1], {"boundary": js.robin(1.0, 1.0, 0.0)})
+        return js.solve(problem, moved).u @ cloud.points[:, 0]
+
+    step = 2e-7  # sides are flat but for a millionth
+    difference = (mean(step) - mean(-step)) / (2 * step)
+    assert np.isclose(jax.grad(mean)(0.0), difference, rtol=1e-5)

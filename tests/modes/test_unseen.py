@@ -1,0 +1,74 @@
+"""What rows of all orders miss alike is in the errors of eigenvalues: jumps, corners, changes of conditions."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+
+import jsmitsm as js
+
+ENDS = {"left": js.dirichlet(0.0), "right": js.dirichlet(0.0)}
+
+
+def told(modes, exact):
+    """The estimated errors in parts of the true ones."""
+    values = np.asarray(modes.values)[: len(exact)]
+    return modes.error_estimate()[: len(exact)] / np.abs(values - exact)
+
+
+@pytest.mark.parametrize("n", [41, 161, 641])
+def test_a_string_whose_mass_jumps(n):
+    """Mass 1 and 9 left and right of c: 3 sin w c cos 3 w (1 - c) + cos w c sin 3 w (1 - c) = 0."""
+    c = 0.4137
+    zero = lambda w: 3 * np.sin(w * c) * np.cos(3 * w * (1 - c)) + np.cos(w * c) * np.sin(3 * w * (1 - c))
+    string = js.Problem(lambda u, x: -js.laplacian(u)(x), ENDS)
+    modes = js.eigen(string, js.interval(0.0, 1.0, n), 1, mass=lambda x: jnp.where(x[0] < c, 1.0, 9.0))
+    assert 0.2 < told(modes, [brentq(zero, 1.0, 1.4) ** 2])[0] < 20
+
+
+@pytest.mark.parametrize("n", [41, 161, 641])
+def test_a_square_well(n):
+    a, depth = 0.4337, 50.0
+    zero = lambda e: np.sqrt(e + depth) * np.tan(np.sqrt(e + depth) * a) - np.sqrt(-e) / np.tanh(np.sqrt(-e) * (3 - a))
+    exact = brentq(zero, -depth + 1e-6, -depth + (np.pi / 2 / a) ** 2 - 1e-6)
+    well = js.Problem(lambda u, x: -js.laplacian(u)(x) - jnp.where(abs(x[0]) < a, depth, 0.0) * u(x), ENDS)
+    assert 0.2 < told(js.eigen(well, js.interval(-3.0, 3.0, n), 1, near=-50.0), [exact])[0] < 10
+
+
+def test_a_bead_that_no_particle_sees():
+    """Its mass is that of half the string; the value without it is three times too large."""
+    bead = lambda x: 1 + jnp.exp(-(((x[0] - 0.4137) / 0.003) ** 2)) / (0.003 * np.sqrt(np.pi))
+    string = js.Problem(lambda u, x: -js.laplacian(u)(x), ENDS)
+    modes = js.eigen(string, js.interval(0.0, 1.0, 41), 1, mass=bead)
+    assert modes.error_estimate()[0] > 0.3 * abs(modes.values[0] - 3.05407) and modes.flags
+
+
+@pytest.mark.parametrize(("spacing", "order"), [(0.1, 4), (0.1, 6), (0.05, 4)])
+def test_where_a_held_side_meets_a_free_one(spacing, order):
+    """The lowest mode of half a disk with half of its flat side free is sin(pi r) / sqrt(r) sin(t / 2)."""
+    t = np.linspace(0, np.pi, 200)
+    half = [(0.0, 0.0), *zip(np.cos(t), np.sin(t))]
+    groups = {"held": lambda x: x[:, 0] >= -1e-9, "free": lambda x: x[:, 1] < 1e-9, "arc": lambda x: x[:, 1] > 0}
+    bcs = {"held": js.dirichlet(0.0), "free": js.neumann(0.0), "arc": js.dirichlet(0.0)}
+    modes = js.eigen(js.Problem(lambda u, x: -js.laplacian(u)(x), bcs), js.from_polygon(half, spacing, groups=groups), 1,
+                     order=order)  # fmt: skip
+    assert 0.15 < told(modes, [np.pi**2])[0] < 5
+
+
+def test_the_corner_of_an_ell():
+    ell = js.from_polygon([(0, 0), (1, 0), (1, 1), (-1, 1), (-1, -1), (0, -1)], 0.1)
+    modes = js.eigen(js.Problem(lambda u, x: -js.laplacian(u)(x), {"boundary": js.dirichlet(0.0)}), ell, 2)
+    ratio = told(modes, [9.6397238440219, 15.197251926454335])
+    assert (0.2 < ratio).all() and (ratio < 15).all()
+
+
+def test_smooth_modes_are_judged_by_two_orders_alone():
+    """Where nothing is missed the other order decides, coefficients that vary or not."""
+    for problem, exact in (
+        (js.Problem(lambda u, x: -js.laplacian(u)(x), ENDS), None),
+        (js.Problem(lambda u, x: -js.laplacian(u)(x) + x[0] ** 2 * u(x), ENDS), np.array([1.0, 3.0])),
+    ):
+        cloud = js.interval(0.0, 1.0, 41) if exact is None else js.interval(-8.0, 8.0, 81)
+        exact = (np.pi * np.arange(1, 3)) ** 2 if exact is None else exact
+        ratio = told(js.eigen(problem, cloud, 2), exact)
+        assert (0.2 < ratio).all() and (ratio < 5).all()
