@@ -8,10 +8,12 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
+from jsmitsm.adaptation.data import Data, unresolved
+from jsmitsm.adaptation.layers import layers
 from jsmitsm.adaptation.spacing_field import SpacingField
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.discretization.coefficients import expect_estimate
-from jsmitsm.runtime.errors import TooCoarse
+from jsmitsm.runtime.errors import TooCoarse, TooFine
 
 # Particles of the first cloud, by dimension: enough for the estimate of a low order, and not more.
 FIRST = {1: 25, 2: 200, 3: 700}
@@ -21,6 +23,8 @@ _OFF = 2.0
 _FINER, _TRIES = 0.6, 40
 # Of the extent of what the maker asked about.
 _COARSE = 0.2
+# The look at source and coefficients, in parts of the largest |u|.
+_PART = 0.05
 
 Make = Callable[[Any], Cloud]
 
@@ -75,6 +79,31 @@ def first_cloud(make: Make, start: Any) -> tuple[Cloud, SpacingField]:
         size, cloud = _finer(make, better)
     points = np.asarray(cloud.points)
     return cloud, SpacingField(points, np.full(len(points), size), _extent(points))
+
+
+def looked_at(
+    data: Data, make: Make, cloud: Cloud, spacing: SpacingField, most: int
+) -> tuple[SpacingField, Cloud]:
+    """A first cloud of at most so many particles that sees source, coefficients, and the layers the operator makes."""
+    part, coarse = _PART, 1.0
+    at, thin = layers(data, cloud, spacing(np.asarray(cloud.points)))
+    for _ in range(20):
+        finer = spacing
+        if not data.plain:
+            points, width = unresolved(data, cloud, spacing.largest_used, part, 1.0, most)
+            finer = finer.joined(points, 1.5 * coarse * width)
+        finer = finer.joined(at, coarse * thin)
+        if finer is spacing:
+            break
+        try:
+            found = make(finer)
+        except TooFine:
+            coarse *= 4.0
+            continue
+        if len(found) <= most:
+            return finer, found
+        part, coarse = 4.0 * part, 2.0 * coarse
+    return spacing, cloud
 
 
 def _extent(points: np.ndarray) -> float:

@@ -68,6 +68,8 @@ def measured(sol: Solution, spacing: np.ndarray, order: int, norm: str, quantity
         gathered = _gathering(found, far, defect.shape, norm)
         return Measured(relative, contribution, scale, apart, gathered=gathered, local=local, missed=unseen)
     number, weights = _weights(sol, quantity)
+    if not np.isfinite(number):
+        return Measured(np.inf, np.ones(len(values)), scale, number=number)
     if weights is None:  # nothing differentiable: the whole solution stands for the number
         return Measured(relative, contribution, scale, number=number)
     away = abs(float(np.sum(weights * error)))
@@ -117,7 +119,7 @@ def _weights(sol: Solution, quantity: Quantity) -> tuple[float, np.ndarray | Non
     def number(values: Any) -> Any:
         (_, *rest), recipe = sol.tree_flatten()
         rest[2] = None  # the local polynomials follow the values
-        return jnp.sum(jnp.asarray(quantity(Solution.tree_unflatten(recipe, (values, *rest)))))
+        return jnp.sum(_alone(jnp.asarray(quantity(Solution.tree_unflatten(recipe, (values, *rest))))))
 
     try:
         made, slope = jax.value_and_grad(number)(values)
@@ -125,11 +127,21 @@ def _weights(sol: Solution, quantity: Quantity) -> tuple[float, np.ndarray | Non
     except (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError, TypeError):
         pass  # it is not written in jax.numpy, or fails
     try:
-        return float(np.asarray(quantity(sol)).sum()), None
+        return float(_alone(np.asarray(quantity(sol))).sum()), None
     except TypeError as error:
         raise ValueError(
             f"quantity: fails ({in_words(error)}); expected a function of a Solution that returns a number"
         ) from error
+
+
+def _alone(number: Any) -> Any:
+    """What a quantity returned, refused where it is not one number."""
+    if number.size != 1:
+        raise ValueError(
+            f"quantity: returns an array of shape {number.shape}, expected one number; search for each by itself, or "
+            "for the largest of their errors, norm='max' without a quantity"
+        )
+    return number
 
 
 def spent(history: dict[str, np.ndarray], tol: float) -> float:

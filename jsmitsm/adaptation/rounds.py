@@ -8,11 +8,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jsmitsm.adaptation import growth
-from jsmitsm.adaptation.data import Data, data_of, unresolved
+from jsmitsm.adaptation.data import Data, data_of
 from jsmitsm.adaptation.edges import edges
-from jsmitsm.adaptation.first_cloud import Make, farther_than_asked, made
+from jsmitsm.adaptation.first_cloud import Make, farther_than_asked, looked_at, made
 from jsmitsm.adaptation.free_ends import off_at_free_ends
-from jsmitsm.adaptation.layers import LOST, along_outflow, layers
+from jsmitsm.adaptation.layers import LOST, along_outflow
 from jsmitsm.adaptation.marking import FAR, ROUGH, SLOW, Marks, marks, next_spacing
 from jsmitsm.adaptation.measure import Measured, Quantity, measured, size, spent
 from jsmitsm.adaptation.spacing_field import SpacingField
@@ -43,8 +43,8 @@ _GAP = 10.0
 _PARTLY = 2.0
 # Near the end of a search one aims at this part of the tolerance, if there are such points.
 _AIMED = 0.6
-# The numbers of two rounds may differ by so many times what the first was thought to be off by.
-_AGREE = 3.0
+# A number that is there at once is asked for once more, with this spacing. The numbers of two rounds may differ by so many times what the first was thought to be off by.
+_CONFIRMED, _AGREE = 0.75, 3.0
 # Where they part, at a corner most often, that falls with this power of the spacing; by so many times what they may,
 # that is known to be the point, and worth more than a round.
 _PARTED, _TORN = 0.5, 30.0
@@ -56,8 +56,8 @@ _FULL = 0.8
 _REFUSED = 4
 # So many attempts are made at a cloud that grows as it should: around a refined point the gradation decides.
 _PUSHED = 3
-# The look at source and coefficients, in parts of the largest |u|; degree of the polynomials it compares with.
-_PART, _DEGREE = 0.05, 4
+# The degree of the polynomials that source and coefficients are compared with.
+_DEGREE = 4
 # A round before with less than this part of the last one's error is what is handed out.
 _BACK = 0.1
 # Makers leave particles so many times the spacing apart that they were asked for, and no more.
@@ -122,7 +122,7 @@ class Rounds:
         self.data = data_of(self.problem, cloud.dim, _DEGREE)
         if self.data is not None:
             self.least = max(self.data.traced.order)
-            spacing, cloud = self._looked_at(cloud, spacing, 1.0)
+            spacing, cloud = looked_at(self.data, self._cloud, cloud, spacing, self.max_particles // 4)
         refused = 0
         for number in range(self.max_rounds):
             try:
@@ -138,6 +138,7 @@ class Rounds:
                 cloud = self._cloud(spacing)
                 continue
             refused = 0
+            self._refuse_no_number()
             shown.reach(spent(self.history(), self.tol))
             shown.note(f"round {number + 1}, {len(cloud)} particles, error {found.error:.1e} of {self.tol:g}")
             done = self._done(sol, found, cloud, spacing)
@@ -159,8 +160,7 @@ class Rounds:
             spacing, cloud = following
 
     def _limit(self, what: str) -> None:
-        between = "" if self.apart is None else " at the particles, more between them"
-        self.messages.append(f"Not reached: the error is estimated at {self.error:.1e}{between}; limited by {what}.")
+        self.messages.append(f"Not reached: the error is estimated at {self.error:.1e}; limited by {what}.")
         coarser = farther_than_asked(self.solution.cloud, self.spacing)
         if coarser > _ASKED:
             self.messages.append(
@@ -183,6 +183,14 @@ class Rounds:
         self.error = self.undoubted = found.error
         self.number_before, self.number = self.number, found.number
         return sol, found
+
+    def _refuse_no_number(self) -> None:
+        known = [number for number in (self.number, self.number_before) if number is not None]
+        if len(known) == 2 and np.isnan(known).all():
+            raise ValueError(
+                f"quantity: returns NaN on clouds of {self.rows[-2][0]} and {self.rows[-1][0]} particles; is a point "
+                "outside of the domain?"
+            )
 
     def _clocked(self) -> None:
         """What was spent since the last row belongs to its round: the check by another order."""
@@ -228,29 +236,6 @@ class Rounds:
     def _cloud(self, spacing: SpacingField) -> Cloud:
         return made(self.make, spacing)
 
-    def _looked_at(self, cloud: Cloud, spacing: SpacingField, scale: float) -> tuple[SpacingField, Cloud]:
-        """A first cloud that sees source, coefficients, and the layers that the operator makes."""
-        assert self.data is not None
-        part, coarse, most = _PART, 1.0, self.max_particles // 4
-        at, thin = layers(self.data, cloud, spacing(np.asarray(cloud.points)))
-        for _ in range(20):
-            finer = spacing
-            if not self.data.plain:
-                points, width = unresolved(self.data, cloud, spacing.largest_used, part, scale, most)
-                finer = finer.joined(points, 1.5 * coarse * width)
-            finer = finer.joined(at, coarse * thin)
-            if finer is spacing:
-                break
-            try:
-                found = self._cloud(finer)
-            except TooFine:
-                coarse *= 4.0
-                continue
-            if len(found) <= most:
-                return finer, found
-            part, coarse = 4.0 * part, 2.0 * coarse
-        return spacing, cloud
-
     # ------------------------------------------------------------------ ends
 
     def _done(self, sol: Solution, found: Measured, cloud: Cloud, spacing: SpacingField) -> bool:
@@ -274,8 +259,15 @@ class Rounds:
                 self.error = max(self.error, float(between[rate < SLOW].max(initial=some)))
         self.undoubted = max(self.error, self._disagreed())
         self.error = max(self.undoubted, self._doubted(found, rate))
-        self.reached = self.error <= self.tol and not self.flags and self.apart is None
+        if self.apart is not None:
+            self.error = max(self.error, float(self.apart.max()) / found.scale / _GAP)
+        self.reached = self.error <= self.tol and not self.flags and not self._unconfirmed
         return self.reached
+
+    @property
+    def _unconfirmed(self) -> bool:
+        """Whether a number is that of a single cloud: the estimate knows no error of what makes it of the values."""
+        return self.quantity is not None and self.number_before is None and self.max_rounds > 1
 
     def _parts(self, sol: Solution, rate: np.ndarray) -> np.ndarray | None:
         """What parts neighbours between them, or may part them from what is true, (N,)."""
@@ -329,6 +321,9 @@ class Rounds:
     # ------------------------------------------------------------------ the next cloud
 
     def _next(self, found: Measured, cloud: Cloud, spacing: SpacingField) -> tuple[SpacingField, Cloud] | None:
+        if self.error <= self.tol and self._unconfirmed:
+            field = spacing.scaled(_CONFIRMED)
+            return field, self._cloud(field)
         points, h = np.asarray(cloud.points), spacing(np.asarray(cloud.points))
         power, error = self._power(cloud), self.undoubted if np.isfinite(self.undoubted) else 1e3
         apart, self.apart = self.apart, None

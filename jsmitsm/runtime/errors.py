@@ -39,6 +39,7 @@ SYMPTOMS = {
     "The equation is not the same": "seam",
     "changes its sign": "turned",
     "is infinite at x =": "poles",
+    "are nearer to the boundary": "near-boundary",
     "do not settle in Newton's method": "unsettled",
     "do not reach their nearest neighbours": "unmet",
     "The estimated error is": "estimate",

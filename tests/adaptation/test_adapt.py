@@ -541,3 +541,42 @@ def test_bad_input_is_told(change, said):
 def test_a_maker_that_never_asks_must_be_told_how_to_begin():
     with pytest.raises(ValueError, match="never asked for the spacing"):
         js.adapt(GOOD, lambda spacing: js.interval(0.0, 1.0, 9), 1e-3)
+
+
+# ------------------------------------------------------------------ numbers
+
+
+def poisson_square():
+    problem = js.Problem(lambda u, x: js.laplacian(u)(x) + 1.0, {"boundary": js.dirichlet(0.0)})
+    return problem, lambda spacing: js.from_polygon(SQUARE, spacing)
+
+
+@pytest.mark.parametrize("name", ["integral", "largest"])
+def test_a_number_is_reached_on_two_clouds_at_least(name):
+    """The estimate knows no error of a quadrature, nor that the largest value lies between the particles."""
+    problem, make = poisson_square()
+    k = np.arange(1, 4001, 2)
+    exact = {"integral": 1 / 12 - 16 / np.pi**5 * np.sum(np.tanh(k * np.pi / 2) / k**5),
+             "largest": 0.0736713532814}[name]  # fmt: skip
+    quantity = {"integral": lambda s: s.integral(), "largest": lambda s: s.u.max()}[name]
+    found = js.adapt(problem, make, 1e-4, quantity=quantity, progress=False)
+    assert found.reached and len(found.history["particles"]) > 1
+    assert abs(found.quantity / exact - 1) < 3e-4
+
+
+def test_what_is_no_number_is_refused():
+    problem, make = poisson_square()
+    with pytest.raises(ValueError, match="quantity: returns an array of shape .2,."):
+        js.adapt(problem, make, 1e-3, quantity=lambda s: s([[0.5, 0.5], [0.2, 0.2]]), progress=False)
+    with pytest.raises(ValueError, match="quantity: returns NaN .* outside of the domain"):
+        js.adapt(problem, make, 1e-3, quantity=lambda s: s([[7.5, 0.5]])[0], progress=False)
+
+
+def test_an_error_that_is_not_reached_is_no_smaller_than_the_tolerance():
+    """Fifty waves on a line: a first cloud that sees none of them agrees with itself at its particles."""
+    k = 314.0
+    problem = js.Problem(
+        lambda u, x: js.laplacian(u)(x) + k**2 * u(x), {"left": js.dirichlet(0.0), "right": js.dirichlet(1.0)}
+    )
+    found = js.adapt(problem, lambda h: js.interval(0.0, 1.0, spacing=h), 1e-4, max_rounds=4, progress=False)
+    assert not found.reached and found.error > 1e-4

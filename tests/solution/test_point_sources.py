@@ -206,3 +206,11 @@ def test_kelvins_solution_balances_its_force(dim, a=1.3, b=3.4):
     slope = jax.vmap(jax.jacfwd(part.at))(normals)
     pull = a * jnp.einsum("nij,nj->ni", slope, normals) + b * jnp.trace(slope, axis1=1, axis2=2)[:, None] * normals
     assert abs(weights @ pull - force).max() < 1e-12
+
+
+@pytest.mark.parametrize(("distance", "told"), [(0.4, False), (0.06, True), (0.02, True), (0.005, True)])
+def test_a_source_nearer_to_the_wall_than_its_particles_to_one_another_is_told(distance, told):
+    disk = js.from_sdf(js.sdf.circle((0, 0), 1.0), ((-1, -1), (1, 1)), 0.12)
+    sources = [js.point_source(np.array([1 - distance, 0.01]), 2 * np.pi)]
+    problem = js.Problem(lambda u, x: js.laplacian(u)(x), {"boundary": js.dirichlet(0.0)}, sources=sources)
+    assert any("nearer to the boundary" in flag for flag in js.solve(problem, disk).flags) == told

@@ -11,7 +11,7 @@ import numpy as np
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.cloud.regions.region_cloud import RegionCloud
 from jsmitsm.equation.unknowns.point_source import Kelvin, Singular, derivative_of
-from jsmitsm.runtime.errors import short
+from jsmitsm.runtime.errors import explained, short
 from jsmitsm.runtime.tracers import concrete, is_traced
 from jsmitsm.solution.evaluation import checked_points, in_domain
 from jsmitsm.solution.look.sizes import NOTHING
@@ -19,6 +19,8 @@ from jsmitsm.solution.regions.located import located
 from jsmitsm.solution.regions.solution import RegionsSolution
 from jsmitsm.solution.solution import Solution
 
+# What the singular part says on a boundary nearer than this part of the spacing there is not seen by its particles.
+NEAR_BOUNDARY = 0.75
 # A source nearer to a particle on an interface than this part of the spacing lies on it.
 ON_INTERFACE = 1e-6
 _TAYLOR = (
@@ -49,8 +51,8 @@ class PointSolution(Solution):
 
     @property
     def flags(self) -> list[str]:
-        """Those of the regular part, unless it is round-off beside the singular one: then that is the solution."""
-        return [] if _negligible(self) else super().flags
+        """Those of the regular part, unless it is round-off beside the singular one, and of sources at a boundary."""
+        return explained([] if _negligible(self) else [*super().flags, *_at_boundary(self.cloud, [self.singular])])
 
     @property
     def coefficients(self) -> Any:
@@ -106,8 +108,9 @@ class RegionsPointSolution(RegionsSolution):
 
     @property
     def flags(self) -> list[str]:
-        """Those of the regular part, unless it is round-off beside the singular one: then that is the solution."""
-        return [] if _negligible(self) else super().flags
+        """Those of the regular part, unless it is round-off beside the singular one, and of sources at a boundary."""
+        told = _at_boundary(self.cloud, list(self.singular.values()))
+        return explained([] if _negligible(self) else [*super().flags, *told])
 
     @property
     def coefficients(self) -> Any:
@@ -132,6 +135,30 @@ class RegionsPointSolution(RegionsSolution):
     @classmethod
     def tree_unflatten(cls, _, leaves):
         return cls.of(*leaves) if isinstance(leaves[0], Solution) else _placeholder(cls, leaves)
+
+
+def _at_boundary(cloud: Cloud, parts: list[Singular | Kelvin]) -> list[str]:
+    """Of sources that are so close to a boundary that its particles do not see what the singular part is there."""
+    from scipy.spatial import cKDTree
+
+    boundary = cloud.boundary
+    points, places = concrete(cloud.points), [concrete(part.places) for part in parts]
+    if cloud.dim == 1 or len(boundary) < 3 or points is None or any(place is None for place in places):
+        return []
+    rim = np.asarray(points)[boundary]
+    tree = cKDTree(rim)
+    at = np.concatenate([np.asarray(place) for place in places])
+    away, nearest = tree.query(at)
+    spacing = tree.query(rim[nearest], k=[2])[0][:, 0]
+    close = np.flatnonzero(away < NEAR_BOUNDARY * spacing)
+    if not len(close):
+        return []
+    worst = close[np.argmin(away[close] / spacing[close])]
+    return [
+        f"{len(close)} point source(s), first at {np.round(at[worst], 6)}, are nearer to the boundary than its particles "
+        f"to one another ({away[worst]:.2g} and {spacing[worst]:.2g}), which do not see what it makes of their "
+        "conditions: refine the boundary there."
+    ]
 
 
 def _negligible(sol: Any) -> bool:
