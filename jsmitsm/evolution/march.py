@@ -225,6 +225,11 @@ def _finished(run: Run, parts: np.ndarray, history: History, fault: str, began: 
     in_time = float(later.max()) / (history.scale or 1.0) if history.in_time.times else None
     if in_time is not None and in_time > LARGE:
         flags.append(f"The estimated error in time is {in_time:.0%} of the solution: take more steps, or a tol.")
+    if run.unseen > LARGE:
+        flags.append(
+            f"The start changes within the spacing, unseen by the particles, by as much as makes {run.unseen:.0%} of it: "
+            "refine there, or smooth it."
+        )
     stats = _statistics(run, began, in_time)
     degree = min(run.order + 2, HIGHEST)
     recipe = Recipe("S", run.order, None, "loo", run.fields, degree - run.order)
@@ -235,7 +240,9 @@ def _finished(run: Run, parts: np.ndarray, history: History, fault: str, began: 
     known = cache(lambda: in_space(run, kept, moved))
 
     def estimate() -> np.ndarray:
-        found = estimated(run, np.asarray(times), *known(), later)
+        sampled = run.unseen * np.abs(states).reshape(len(states), -1).max(axis=1)
+        sampled[0] = 0.0  # at the particles the start is right
+        found = estimated(run, np.asarray(times), *known(), later + sampled)
         part = float(found.max(initial=0.0)) / (history.scale or 1.0)
         if part > LARGE and not (in_time is not None and in_time > LARGE):
             flags.append(f"The estimated error is {part:.0%} of the solution: refine the cloud, or raise the order.")

@@ -30,6 +30,8 @@ DRIFT = 0.1
 class Run:
     """A run of one problem on one cloud."""
 
+    unseen = 0.0  # the part of the start that its particles do not see
+
     def __init__(self, timed: Timed, cloud: Cloud, start: tuple[Any, ...], t: Any, began: float, *, order: int,
                  scheme: str, damping: Any, stencils: Any, throw: bool, depth: int):  # fmt: skip
         self.timed, self.cloud, self.start, self.t, self.began = timed, cloud, start, t, began

@@ -48,6 +48,7 @@ SYMPTOMS = {
     "do not resolve the kernel": "kernel",
     "where regions meet": "meeting",
     "The estimated error in time": "time",
+    "The start changes within the spacing": "start",
     "Between neighbouring particles convection": "drift",
     "has the wrong sign": "sign",
     "free of divergence": "divergence",

@@ -1,0 +1,61 @@
+"""Errors of evolutions that are not like those of smooth heat: what grows, what is over soon, what was never seen."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jsmitsm as js
+
+ENDS = {"left": js.dirichlet(0.0), "right": js.dirichlet(0.0)}
+
+
+@pytest.mark.parametrize("rate", [12.0, 20.0, 30.0])
+@pytest.mark.parametrize("waves", [1, 2])
+def test_what_grows(rate, waves):
+    """u_t = u'' + rate u: from two half-waves the error, of which the lowest grows, is soon all there is."""
+    problem = js.Problem(lambda u, x, t: js.dt(u)(x) - js.laplacian(u)(x) - rate * u(x), ENDS)
+    run = js.evolve(problem, js.interval(0.0, 1.0, 41), lambda x: jnp.sin(waves * jnp.pi * x[0]), t=(0.0, 1.0), tol=1e-8)
+    exact = np.exp(rate - (waves * np.pi) ** 2) * np.sin(waves * np.pi * run.cloud.points[:, 0])
+    ratio = float(run.error_estimate()[-1].max()) / np.abs(run.u[-1] - exact).max()
+    assert 0.5 < ratio < 2.0
+
+
+def test_what_is_over_soon():
+    """A wave of five particles is gone after a hundredth of the time, and its error goes on with the slow one."""
+    problem = js.Problem(lambda u, x, t: js.dt(u)(x) - js.laplacian(u)(x), ENDS)
+    start = lambda x: jnp.sin(jnp.pi * x[0]) + jnp.sin(9 * jnp.pi * x[0])
+    run = js.evolve(problem, js.interval(0.0, 1.0, 41), start, t=(0.0, 0.2), tol=1e-6, save=20)
+    x = run.cloud.points[:, 0]
+    exact = [sum(np.exp(-((k * np.pi) ** 2) * t) * np.sin(k * np.pi * x) for k in (1, 9)) for t in run.t]
+    error, told = np.abs(run.u - np.array(exact)).max(), run.error_estimate().max()
+    assert 0.3 * error < told < 30 * error
+
+
+@pytest.mark.parametrize("n", [21, 31, 51])
+def test_a_start_that_jumps(n):
+    """A hot disk in an insulated box: at the end its heat is spread evenly, what the particles have of it."""
+    box = js.rectangle((0, 0), (1, 1), (n, n))
+    hot = lambda x: jnp.where(jnp.hypot(x[0] - 0.5, x[1] - 0.5) < 0.3, 1.0, 0.0)
+    sides = dict.fromkeys(("left", "right", "bottom", "top"), js.neumann(0.0))
+    problem = js.Problem(lambda u, x, t: js.dt(u)(x) - js.laplacian(u)(x), sides)
+    run = js.evolve(problem, box, hot, t=(0.0, 1.0), tol=1e-5)
+    error = np.abs(run.u[-1] / (np.pi * 0.09) - 1).max()
+    assert run.error_estimate()[-1].max() / (np.pi * 0.09) > error / 6
+    assert (run.error_estimate()[0] == 0).all()
+
+
+def test_a_spot_that_no_particle_sees():
+    problem = js.Problem(lambda u, x, t: js.dt(u)(x) - js.laplacian(u)(x), ENDS)
+    spot = lambda x: jnp.exp(-(((x[0] - 0.5137) / 0.004) ** 2)) + 0.01 * jnp.sin(jnp.pi * x[0])
+    run = js.evolve(problem, js.interval(0.0, 1.0, 41), spot, t=(0.0, 0.01), steps=20)
+    assert any("The start changes within the spacing" in flag for flag in run.flags)
+
+
+def test_smooth_starts_and_arrays_are_not_doubted():
+    problem = js.Problem(lambda u, x, t: js.dt(u)(x) - js.laplacian(u)(x), ENDS)
+    cloud = js.interval(0.0, 1.0, 41)
+    start = lambda x: jnp.exp(-(((x[0] - 0.5) / 0.1) ** 2)) + jnp.sin(6 * jnp.pi * x[0])
+    for given in (start, np.asarray(jax.vmap(start)(cloud.points))):
+        run = js.evolve(problem, cloud, given, t=(0.0, 0.1), tol=1e-6)
+        assert run.flags == [] and run.error_estimate().max() < 1e-3
