@@ -37,8 +37,8 @@ _REACH, _AFFECTED = 4.0, 25.0
 _POINT = 0.5
 # Of a line of them there are at least so many within so many spacings.
 _ALONG, _FEW = 12.0, 5
-# From one of many there are others as bad (in parts of it) at distances between these, in its spacings; around a lone one
-# there are none.
+# From one of many there are others as bad (in parts of it) at distances between these, in its spacings; around a lone
+# one there are none.
 _AS_BAD, _FROM, _TO = 0.1, 6.0, 15.0
 # So many particles of a line are looked at together.
 _LINED = 48

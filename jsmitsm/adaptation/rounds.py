@@ -43,8 +43,8 @@ _GAP = 10.0
 _PARTLY = 2.0
 # Near the end of a search one aims at this part of the tolerance, if there are such points.
 _AIMED = 0.6
-# A number that is there at once is asked for once more, with this spacing. The numbers of two rounds may differ by so many times what the first was thought to be off by.
-_CONFIRMED, _AGREE = 0.75, 3.0
+# A number that is there at once is asked for again at this spacing. Two may differ by so many times what was thought.
+_CONFIRMED, _AGREE = 0.75, 2.0
 # Where they part, at a corner most often, that falls with this power of the spacing; by so many times what they may,
 # that is known to be the point, and worth more than a round.
 _PARTED, _TORN = 0.5, 30.0
@@ -87,6 +87,7 @@ class Rounds:
         self.solution: Solution = None  # type: ignore[assignment]
         self.spacing: SpacingField = None  # type: ignore[assignment]
         self.error, self.reached = np.inf, False
+        self.checked = self.checked_before = np.inf  # the error without what two rounds' numbers differ by
         self.undoubted = np.inf  # the error without the doubt where smoothness ends, which marking has as well
         self.number: float | None = None
         self.number_before: float | None = None
@@ -180,6 +181,7 @@ class Rounds:
         self.clock = now
         self.earlier = None if self.solution is None else remembered(self.solution)
         self.spacing, self.solution = spacing, sol
+        self.checked_before, self.checked = self.checked, found.error
         self.error = self.undoubted = found.error
         self.number_before, self.number = self.number, found.number
         return sol, found
@@ -187,10 +189,7 @@ class Rounds:
     def _refuse_no_number(self) -> None:
         known = [number for number in (self.number, self.number_before) if number is not None]
         if len(known) == 2 and np.isnan(known).all():
-            raise ValueError(
-                f"quantity: returns NaN on clouds of {self.rows[-2][0]} and {self.rows[-1][0]} particles; is a point "
-                "outside of the domain?"
-            )
+            raise ValueError("quantity: returns NaN on two clouds; is a point outside of the domain?")
 
     def _clocked(self) -> None:
         """What was spent since the last row belongs to its round: the check by another order."""
@@ -257,6 +256,7 @@ class Rounds:
                 if self.before is None:
                     some = max(some, stands_out(np.asarray(cloud.points), spacing(np.asarray(cloud.points)), between))
                 self.error = max(self.error, float(between[rate < SLOW].max(initial=some)))
+        self.checked = self.error
         self.undoubted = max(self.error, self._disagreed())
         self.error = max(self.undoubted, self._doubted(found, rate))
         if self.apart is not None:
@@ -266,7 +266,7 @@ class Rounds:
 
     @property
     def _unconfirmed(self) -> bool:
-        """Whether a number is that of a single cloud: the estimate knows no error of what makes it of the values."""
+        """Whether a number is that of a single cloud: no estimate knows what makes it of the values."""
         return self.quantity is not None and self.number_before is None and self.max_rounds > 1
 
     def _parts(self, sol: Solution, rate: np.ndarray) -> np.ndarray | None:
@@ -289,7 +289,7 @@ class Rounds:
         if self.number is None or self.number_before is None:
             return 0.0
         change = abs(self.number - self.number_before) / (abs(self.number) or 1.0)
-        return change - _AGREE * self.rows[-2][2]
+        return change - _AGREE * self.checked_before
 
     def _checked(self, sol: Solution, found: Measured, cloud: Cloud, spacing: SpacingField) -> None:
         """Where the solution of another order is farther away than the tolerance, that is the error.

@@ -1,7 +1,7 @@
 """Which side's normal a condition takes at a corner.
 
-At a corner within a group the cloud's normal is the bisector of the sides', and what is said of the slope along a side's
-normal says something else along the bisector. Between two groups it is the own side's already.
+At a corner within a group the cloud's normal is the bisector of the sides', and what is said of the slope along a
+side's normal says something else along the bisector. Between two groups it is the own side's already.
 """
 
 from __future__ import annotations
@@ -36,7 +36,8 @@ def side_normals(cloud: Cloud) -> Any:
     if not len(at):
         return cloud.normals
     if is_traced(cloud.normals):
-        return jnp.asarray(cloud.normals).at[at].set(cloud.normals[side])
+        given = jnp.asarray(cloud.normals)
+        return given.at[at].set(given[side])
     found = np.array(normals)
     found[at] = found[side]
     return found

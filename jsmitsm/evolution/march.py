@@ -227,8 +227,8 @@ def _finished(run: Run, parts: np.ndarray, history: History, fault: str, began: 
         flags.append(f"The estimated error in time is {in_time:.0%} of the solution: take more steps, or a tol.")
     if run.unseen > LARGE:
         flags.append(
-            f"The start changes within the spacing, unseen by the particles, by as much as makes {run.unseen:.0%} of it: "
-            "refine there, or smooth it."
+            f"The start changes within the spacing, unseen by the particles, by as much as makes {run.unseen:.0%} of "
+            "it: refine there, or smooth it."
         )
     stats = _statistics(run, began, in_time)
     degree = min(run.order + 2, HIGHEST)

@@ -17,17 +17,17 @@ from jsmitsm.cloud.regions.region_cloud import RegionCloud
 from jsmitsm.particle.polynomials import monomials_on_host
 from jsmitsm.runtime.tracers import is_traced
 
-# The degree of the polynomials that the start is compared with, and what differs by much, in parts of the largest value:
-# four particles a wavelength leave a fortieth, a jump a half.
+# The degree of the polynomials that the start is compared with, and what differs by much, in parts of the largest
+# value: four particles a wavelength leave a fortieth, a jump a half.
 DEGREE, MUCH = 4, 0.1
 
 
 def unseen_start(u0: Any, values: Any, cloud: Cloud, second: bool, expanded: Callable[[Any], Any]) -> float:
     """The part of the start, a function of x with ``values`` (N, F) at the particles, that these do not see.
 
-    expanded: the local polynomials (N, F, K) of values, of degree ``DEGREE``. Halfway to the nearest neighbours they are
-    compared with it. Those that differ by much are taken to be off by chance, each for the volume that it has: in a sum
-    over the domain the squares add up. Zero for arrays, in several regions, and where JAX traces.
+    expanded: the local polynomials (N, F, K) of values, of degree ``DEGREE``. Halfway to the nearest neighbours they
+    are compared with it. Those that differ by much are taken to be off by chance, each for the volume that it has: in a
+    sum over the domain the squares add up. Zero for arrays, in several regions, and where JAX traces.
     """
     u0 = u0[0] if second and isinstance(u0, (tuple, list)) else u0
     if not callable(u0) or isinstance(cloud, RegionCloud) or len(cloud) < 3 or is_traced(values, cloud):

@@ -76,8 +76,9 @@ def unseen(question: Question, found: Pairs, mode: Callable[[int], Solution]) ->
         if parted is not None and max(disc.rec.orders) == 2 and largest > 0:
             out[k] = value * (float(parted.max(initial=0.0)) / largest) ** 2
         if not same_everywhere(disc):
-            missed = np.abs(found.left[:, k] @ (pencil.B.host @ _left_between(sol, disc))[pencil.free])
-            out[k] = max(out[k], missed / np.abs(found.left[:, k] @ (question.inert.host @ values.ravel()[pencil.free])))
+            left = found.left[:, k]
+            missed = left @ (pencil.B.host @ _left_between(sol, disc))[pencil.free]
+            out[k] = max(out[k], np.abs(missed / (left @ (question.inert.host @ values.ravel()[pencil.free]))))
     for cluster in np.unique(found.cluster):
         at = found.cluster == cluster
         out[at] = out[at].max()

@@ -261,7 +261,8 @@ class Modes(Copied):
         """Estimated errors of the values, by the pencil of order p + 2, assembled when first asked for.
 
         In one region the larger of that and of what no order sees: jumps of coefficients or of the mass between the
-        particles, and corners of the modes. For values of a cluster that of the cluster. Infinite where there is no other order to compare with.
+        particles, and corners of the modes. For values of a cluster that of the cluster. Infinite where there is no
+        other order to compare with.
 
         Returns
         -------

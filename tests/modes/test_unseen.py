@@ -50,8 +50,8 @@ def test_where_a_held_side_meets_a_free_one(spacing, order):
     half = [(0.0, 0.0), *zip(np.cos(t), np.sin(t))]
     groups = {"held": lambda x: x[:, 0] >= -1e-9, "free": lambda x: x[:, 1] < 1e-9, "arc": lambda x: x[:, 1] > 0}
     bcs = {"held": js.dirichlet(0.0), "free": js.neumann(0.0), "arc": js.dirichlet(0.0)}
-    modes = js.eigen(js.Problem(lambda u, x: -js.laplacian(u)(x), bcs), js.from_polygon(half, spacing, groups=groups), 1,
-                     order=order)  # fmt: skip
+    problem, cloud = js.Problem(lambda u, x: -js.laplacian(u)(x), bcs), js.from_polygon(half, spacing, groups=groups)
+    modes = js.eigen(problem, cloud, 1, order=order)
     assert 0.15 < told(modes, [np.pi**2])[0] < 5
 
 

@@ -241,7 +241,8 @@ def _regular(
         return Condition(c.kind, c.field, **rest, value=sampled("value") - there)
     if cloud.normals is None:
         return c  # refused by name later
-    slope = of_singular(lambda singular, x, n: jax.jvp(singular.at, (x,), (n,))[1], jnp.asarray(side_normals(cloud))[ids])
+    normals = jnp.asarray(side_normals(cloud))[ids]
+    slope = of_singular(lambda singular, x, n: jax.jvp(singular.at, (x,), (n,))[1], normals)
     if c.kind == "neumann":
         return Condition(c.kind, c.field, value=sampled("value") - slope)
     a, b = sampled("a"), sampled("b")

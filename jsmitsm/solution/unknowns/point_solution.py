@@ -155,9 +155,9 @@ def _at_boundary(cloud: Cloud, parts: list[Singular | Kelvin]) -> list[str]:
         return []
     worst = close[np.argmin(away[close] / spacing[close])]
     return [
-        f"{len(close)} point source(s), first at {np.round(at[worst], 6)}, are nearer to the boundary than its particles "
-        f"to one another ({away[worst]:.2g} and {spacing[worst]:.2g}), which do not see what it makes of their "
-        "conditions: refine the boundary there."
+        f"{len(close)} point source(s), first at {np.round(at[worst], 6)}, are nearer to the boundary than its "
+        f"particles to one another ({away[worst]:.2g} and {spacing[worst]:.2g}), which do not see what it makes of "
+        "their conditions: refine the boundary there."
     ]
 
 
