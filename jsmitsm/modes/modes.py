@@ -12,7 +12,7 @@ import numpy as np
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.discretization.layout import table
 from jsmitsm.discretization.regions.layout import Regions
-from jsmitsm.modes.estimate import conditions, errors, unseen
+from jsmitsm.modes.estimate import conditions, errors
 from jsmitsm.modes.mass import mass_times
 from jsmitsm.modes.question import Question
 from jsmitsm.modes.spectrum import Pairs
@@ -260,9 +260,8 @@ class Modes(Copied):
     def error_estimate(self) -> np.ndarray:
         """Estimated errors of the values, by the pencil of order p + 2, assembled when first asked for.
 
-        In one region the larger of that and of what no order sees: jumps of coefficients or of the mass between the
-        particles, and corners of the modes. For values of a cluster that of the cluster. Infinite where there is no
-        other order to compare with.
+        In one region jumps between the particles and corners of the modes count, which no order sees. For values of a
+        cluster that of the cluster. Infinite where there is no other order to compare with.
 
         Returns
         -------
@@ -286,9 +285,7 @@ class Modes(Copied):
         """
         if self._errors is None:
             found = self._host("error_estimate")
-            question = self._known("error_estimate")
-            missed = unseen(question, found, self._between)
-            self._errors = frozen(np.maximum(errors(question, found), missed))
+            self._errors = frozen(errors(self._known("error_estimate"), found, self._between))
         return self._errors
 
     @property

@@ -473,7 +473,7 @@ def test_numbers_that_move_more_than_was_thought_are_not_believed():
     assert search._disagreed() == 0.0
     search.number_before = 1.03
     assert search._disagreed() == pytest.approx(0.028)
-    search.number_before = 1.002
+    search.number_before = 1.0019
     assert search._disagreed() <= 0.0
 
 
