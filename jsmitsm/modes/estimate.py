@@ -32,10 +32,10 @@ def conditions(question: Question, found: Pairs) -> np.ndarray:
 
 
 @bar("error estimate", parts=PENCIL)
-def errors(question: Question, found: Pairs, mode: Callable[[int], Solution]) -> np.ndarray:
+def errors(question: Question, found: Pairs, mode: Callable[[int], Solution] | None = None) -> np.ndarray:
     """Estimated errors (k,) of the values; infinite where there is no other order to compare with.
 
-    The larger of what two orders tell and of what none sees (``unseen``).
+    With the modes between the particles, what no order sees is in them (``unseen``).
 
     With A', C' of order p + 2, rows D scaled to those of A, and y^T C v = 1, to first order
 
@@ -53,7 +53,7 @@ def errors(question: Question, found: Pairs, mode: Callable[[int], Solution]) ->
     for cluster in np.unique(found.cluster):
         at = np.flatnonzero(found.cluster == cluster)
         out[at] = np.linalg.norm(moved[np.ix_(at, at)], 2)
-    return np.maximum(out, unseen(question, found, mode))
+    return out if mode is None else np.maximum(out, unseen(question, found, mode))
 
 
 def unseen(question: Question, found: Pairs, mode: Callable[[int], Solution]) -> np.ndarray:

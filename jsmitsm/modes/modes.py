@@ -260,8 +260,8 @@ class Modes(Copied):
     def error_estimate(self) -> np.ndarray:
         """Estimated errors of the values, by the pencil of order p + 2, assembled when first asked for.
 
-        In one region jumps between the particles and corners of the modes count, which no order sees. For values of a
-        cluster that of the cluster. Infinite where there is no other order to compare with.
+        In one region jumps and corners count too, which no order sees. For values of a cluster that of the cluster.
+        Infinite where there is no other order to compare with.
 
         Returns
         -------
@@ -284,8 +284,8 @@ class Modes(Copied):
         True
         """
         if self._errors is None:
-            found = self._host("error_estimate")
-            self._errors = frozen(errors(self._known("error_estimate"), found, self._between))
+            found, question = self._host("error_estimate"), self._known("error_estimate")
+            self._errors = frozen(errors(question, found, self._between))
         return self._errors
 
     @property
@@ -300,8 +300,7 @@ class Modes(Copied):
         out = []
         if np.isinf(error).any():
             out.append("There is no error estimate: the cloud has too few particles for expansions of another order.")
-        bad = np.flatnonzero(np.isfinite(part) & (part > LARGE))
-        if len(bad):
+        if len(bad := np.flatnonzero(np.isfinite(part) & (part > LARGE))):
             out.append(
                 f"{len(bad)} of {len(part)} modes, {some(bad)}, are not resolved, or spurious: their estimated errors "
                 f"are up to {part[bad].max():.0%} of their values; refine the cloud, or raise the order."
