@@ -19,7 +19,7 @@ from jsmitsm.evolution.regions.run import RegionsRun
 from jsmitsm.evolution.regions.timed import regions_timed
 from jsmitsm.evolution.run import Run
 from jsmitsm.evolution.space.timed import timed
-from jsmitsm.evolution.unseen_start import DEGREE, unseen_start
+from jsmitsm.evolution.unseen import DEGREE, unseen_start
 from jsmitsm.runtime.arrays import ValueOrFunction
 from jsmitsm.runtime.errors import explaining, short
 from jsmitsm.runtime.progress import PENCIL, bar

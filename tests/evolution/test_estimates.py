@@ -60,3 +60,37 @@ def test_smooth_starts_and_arrays_are_not_doubted():
     for given in (start, np.asarray(jax.vmap(start)(cloud.points))):
         run = js.evolve(problem, cloud, given, t=(0.0, 0.1), tol=1e-6)
         assert run.flags == [] and run.error_estimate().max() < 1e-3
+
+
+C = 0.4137  # where something jumps, between particles
+
+
+def jumping(name):
+    """The problem, its start, and the exact state at the end of three (reaction: five) units of time."""
+    if name == "source":
+        a = 5 * (1 - C) ** 2
+        pde = lambda u, x, t: js.dt(u)(x) - js.laplacian(u)(x) - jnp.where(x[0] > C, 10.0, 0.0)
+        return pde, ENDS, lambda x: 0.0 * x[0], lambda x: a * x - np.where(x > C, 5 * (x - C) ** 2, 0.0)
+    if name == "capacity":  # the lowest mode of a string whose mass is 1 and 9
+        value = 1.45285783
+        w = np.sqrt(value)
+        b = np.sin(w * C) / np.sin(3 * w * (1 - C))
+        mode = lambda x, of: of.where(x < C, of.sin(w * x), b * of.sin(3 * w * (1 - x)))
+        pde = lambda u, x, t: jnp.where(x[0] < C, 1.0, 9.0) * js.dt(u)(x) - js.laplacian(u)(x)
+        return pde, ENDS, lambda x: mode(x[0], jnp), lambda x: mode(x, np) * np.exp(-3 * value)
+    k = 20.0
+    a = 1 / (np.cosh(k * (1 - C)) + C * k * np.sinh(k * (1 - C)))
+    slope = -k * a * np.sinh(k * (1 - C))
+    pde = lambda u, x, t: js.dt(u)(x) - js.laplacian(u)(x) + jnp.where(x[0] > C, k**2, 0.0) * u(x)
+    bcs = {"left": js.dirichlet(1.0), "right": js.neumann(0.0)}
+    return pde, bcs, lambda x: 1 - x[0], lambda x: np.where(x < C, 1 + slope * x, a * np.cosh(k * (1 - x)))
+
+
+@pytest.mark.parametrize("n", [41, 161])
+@pytest.mark.parametrize("name", ["source", "capacity", "reaction"])
+def test_what_jumps_between_the_particles(name, n):
+    pde, bcs, start, exact = jumping(name)
+    end = 5.0 if name == "reaction" else 3.0
+    run = js.evolve(js.Problem(pde, bcs), js.interval(0.0, 1.0, n), start, t=(0.0, end), tol=1e-6)
+    error = np.abs(run.u[-1] - exact(run.cloud.points[:, 0])).max()
+    assert 0.5 < run.error_estimate()[-1].max() / error < 15.0
