@@ -22,6 +22,8 @@ SMOOTH = math.cos(math.radians(30.0))
 _STEPS = 8
 # Heights over a facet, in sizes of its surroundings, and differences of normals, that are round-off.
 _FLAT = 1e-9
+# The boundary is at most so many widths of a facet away, and its normal at such an angle (its cosine) to the way there.
+_FAR, _STEEP = 0.5, 0.1
 
 
 def domain_rule(cloud: Cloud, degree: int) -> tuple[np.ndarray, np.ndarray]:
@@ -93,6 +95,11 @@ def _swept(cloud: Cloud, facets: np.ndarray, normal: np.ndarray, degree: int) ->
     # Where the shape is known the graph is the start of the way there only.
     graph = _graphs(cloud, corners, facets, normal, degree if cloud._shape is None else min(degree, 4))
     reach, outward = _to_shape(cloud, base, way, normal, *graph(base, way))
+    # No boundary is so far from a facet: polynomials of particles across a gap, or around a sharp corner, go astray.
+    width = np.linalg.norm(np.ptp(corners, axis=1), axis=1)[:, None]
+    sane = (np.abs(reach) <= _FAR * width) & (np.einsum("mqd,mqd->mq", way, outward) >= _STEEP)
+    sane = sane.all(axis=1, keepdims=True)
+    reach, outward = np.where(sane, reach, 0.0), np.where(sane[..., None], outward, normal[:, None])
     sides = corners[:, 1:] - corners[:, :1]
     handed = np.sign(np.linalg.det(np.concatenate([sides, normal[:, None]], axis=1)))
     return _Swept(base, way, reach, weights, sides, ways[:, 1:] - ways[:, :1], handed[:, None], outward)
@@ -114,6 +121,7 @@ def _graphs(cloud: Cloud, corners: np.ndarray, facets: np.ndarray, normal: np.nd
     # A facet's own corners are on its side, whatever normal they have.
     alike |= (near[:, :, None] == facets[:, None, :]).any(axis=2)
     size = np.where(alike, distance, 0.0).max(axis=1)
+    size = np.where(size > 0.0, size, 1.0)  # nobody around looks where the facet does: it is flat
     offset = (points[near] - middle[:, None]) / size[:, None, None]
     place, level = np.einsum("mkd,mtd->mkt", offset, tangents), np.einsum("mkd,md->mk", offset, normal)
     weight = np.where(alike, np.exp(-((1.5 * distance / size[:, None]) ** 2)), 0.0)
