@@ -114,7 +114,14 @@ def correction(fit: Fit, values: Any, made: Run | None = None) -> Correction:
     order = _beside(fit, low)
     high, high_nums = _of_order(fit, low, order)
     above = Run(high, fit.problem, "auto", True, True, "loo")
-    high_rows = above.local_rows(high_nums)
+    try:
+        high_rows = above.local_rows(high_nums)
+    except SolveError:  # too few neighbours for so high an order: a lower one is off by as much as p, or more
+        below = lower(fit.recipe.order, max(low.rec.orders))
+        if below == fit.recipe.order:
+            raise
+        error, units, _ = _towards(fit, low, values, below)
+        return Correction(error, error, None, None, units)
     entries = matrix(high, *high_rows)
     residual = _residual(high, *high_rows, high_nums, entries, values)
     trust = _trust(high, *high_rows)

@@ -54,3 +54,26 @@ def test_which_order_is_compared_with():
     assert compared(order=4, depth=4, most=2, least=2) == 3
     assert compared(order=4, depth=4, most=2, least=4) == 6  # a beam has no lower one
     assert [lower(p, 2) for p in range(2, 9)] == [2, 2, 3, 3, 5, 5, 7]
+
+
+def test_where_no_higher_order_is_determined_a_lower_one_is_compared(monkeypatch):
+    """Systems of rows of order p + 2 that determine nothing were the end of the estimate."""
+    from jsmitsm.runtime.errors import SolveError
+    from jsmitsm.solution.run import Run
+
+    own = Run.local_rows
+
+    def local_rows(self, nums):
+        if self.disc.rec.order > 4:
+            raise SolveError("the moment systems of 18 particle(s) do not determine the solution", [1])
+        return own(self, nums)
+
+    exact = lambda x: jnp.exp(x[0]) * jnp.sin(2 * x[1])
+    problem = js.Problem(
+        lambda u, x: js.laplacian(u)(x) - js.laplacian(exact)(x),
+        {side: js.dirichlet(exact) for side in ("left", "right", "bottom", "top")},
+    )
+    sol = js.solve(problem, js.rectangle((0, 0), (1, 1), (11, 11), jitter=0.2), order=4)
+    error = np.abs(sol.u - np.asarray(jax.vmap(exact)(sol.cloud.points))).max()
+    monkeypatch.setattr(Run, "local_rows", local_rows)
+    assert error < sol.error_estimate().max() < 1000 * error
