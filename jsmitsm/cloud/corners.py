@@ -1,7 +1,7 @@
-"""Which side's normal a condition takes at a corner.
+"""Which normals conditions take at a corner within a group.
 
-At a corner within a group the cloud's normal is the bisector of the sides', and what is said of the slope along a
-side's normal says something else along the bisector. Between two groups it is the own side's already.
+There the cloud's normal is the bisector of the sides', and what is said of the slope along a side's normal says
+something else along the bisector. Between two groups it is the own side's already.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ _AROUND = {2: 6, 3: 20}
 _FLAT, _EQUAL = 1e-6, 1e-9
 # Normals at a smaller angle (its cosine) are the side's own; two ways in a plane differ by more than this (its sine).
 _OWN, _ACROSS = np.cos(np.radians(1.0)), 0.1
-# Of several sides that one is taken whose normal is the largest in this direction, whatever the order of particles.
-_FIRST = np.array([1.0, 0.6, 0.36])
+# Sides come in the order of their normals in this direction, whatever the order of particles; no corner has more.
+_FIRST, _SIDES = np.array([1.0, 0.6, 0.36]), 4
 
 
 def side_normals(cloud: Cloud) -> Any:
@@ -29,25 +29,44 @@ def side_normals(cloud: Cloud) -> Any:
 
     Corners between curved sides keep theirs: a particle at the tip of an ellipse looks alike.
     """
+    at, sides = _known(cloud)
+    return _replaced(cloud.normals, at, lambda given: given[sides[:, 0]])
+
+
+def mean_normals(cloud: Cloud) -> Any:
+    """The same, at reentrant corners with the means of all flat sides' normals, shorter than one.
+
+    What is linear in the normal and holds for every side holds for them. Solutions are singular there: one side alone
+    makes three times their errors, while at other corners it is better than the mean.
+    """
+    at, sides = _known(cloud)
+    there = (sides >= 0)[..., None]
+    return _replaced(cloud.normals, at, lambda given: (given[sides] * there).sum(axis=1) / there.sum(axis=1))
+
+
+def _replaced(normals: Any, at: np.ndarray, found: Any) -> Any:
+    if not len(at):
+        return normals
+    if is_traced(normals):
+        return jnp.asarray(normals).at[at].set(found(jnp.asarray(normals)))
+    new = np.array(normals)
+    new[at] = found(new)
+    return new
+
+
+def _known(cloud: Cloud) -> tuple[np.ndarray, np.ndarray]:
+    """The particles (C,) at corners within their group, and for each one particle of every flat side (C, k), or -1."""
     points, normals = concrete(cloud.points), concrete(cloud.normals)
     if cloud.dim == 1 or points is None or normals is None:
-        return cloud.normals
-    at, side = kept(cloud, "corners", lambda: _corners(np.asarray(points), np.asarray(normals), cloud.groups))
-    if not len(at):
-        return cloud.normals
-    if is_traced(cloud.normals):
-        given = jnp.asarray(cloud.normals)
-        return given.at[at].set(given[side])
-    found = np.array(normals)
-    found[at] = found[side]
-    return found
+        return np.zeros(0, int), np.zeros((0, _SIDES), int)
+    return kept(cloud, "corners", lambda: _corners(np.asarray(points), np.asarray(normals), cloud.groups))
 
 
 def _corners(points: np.ndarray, normals: np.ndarray, groups: Any) -> tuple[np.ndarray, np.ndarray]:
-    """The particles at corners within their group, and for each one of a flat side that it belongs to."""
     found = [_in_group(points, normals, np.asarray(ids)) for name, ids in groups.items() if name != INTERIOR]
-    at, side = (np.concatenate(part) for part in zip(*found)) if found else (np.zeros(0, int), np.zeros(0, int))
-    return at, side
+    none = np.zeros(0, int), np.zeros((0, _SIDES), int)
+    at, sides = (np.concatenate(part) for part in zip(*(found or [none])))
+    return at, sides
 
 
 def _in_group(points: np.ndarray, normals: np.ndarray, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -55,7 +74,7 @@ def _in_group(points: np.ndarray, normals: np.ndarray, ids: np.ndarray) -> tuple
 
     ids = ids[np.isfinite(normals[ids]).all(axis=1)]
     if len(ids) < 3:
-        return np.zeros(0, int), np.zeros(0, int)
+        return np.zeros(0, int), np.zeros((0, _SIDES), int)
     at, normal, dim = points[ids], normals[ids], points.shape[1]
     away, near = cKDTree(at).query(at, k=range(2, min(_AROUND[dim] + 1, len(ids)) + 1))
     theirs, way = normal[near], (at[near] - at[:, None]) / np.maximum(away, 1e-300)[..., None]
@@ -64,10 +83,19 @@ def _in_group(points: np.ndarray, normals: np.ndarray, ids: np.ndarray) -> tuple
     some = np.flatnonzero(flat.sum(axis=1) >= dim)
     way, theirs, flat = way[some], theirs[some], flat[some]
     # Another particle of the same side: in space not on the same edge, whose normal is that of no side.
-    alike = flat[:, :, None] & flat[:, None, :] & (np.einsum("bkd,bld->bkl", theirs, theirs) > 1.0 - _EQUAL)
+    same = np.einsum("bkd,bld->bkl", theirs, theirs) > 1.0 - _EQUAL
+    alike = flat[:, :, None] & flat[:, None, :] & same
     if dim == 3:
         alike &= np.linalg.norm(np.cross(way[:, :, None], way[:, None, :]), axis=3) > _ACROSS
     alike &= ~np.eye(alike.shape[1], dtype=bool)
     score = np.where(alike.any(axis=2), theirs @ _FIRST[:dim], -np.inf)
-    first, good = score.argmax(axis=1), np.isfinite(score).any(axis=1)
-    return ids[some[good]], ids[near[some[good], first[good]]]
+    sides, rows = np.full((len(some), _SIDES), -1), np.arange(len(some))
+    main = score.argmax(axis=1)
+    ahead = np.isfinite(score) & (np.einsum("bkd,bd->bk", way, theirs[rows, main]) > _ACROSS)
+    for k in range(_SIDES):
+        first = score.argmax(axis=1)
+        good = np.isfinite(score[rows, first]) & (ahead.any(axis=1) | (k == 0))
+        sides[good, k] = near[some[good], first[good]]
+        score = np.where(same[rows, first], -np.inf, score)
+    good = sides[:, 0] >= 0
+    return ids[some[good]], np.where(sides[good] >= 0, ids[sides[good]], -1)

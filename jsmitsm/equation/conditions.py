@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm.cloud.cloud import INTERIOR, Cloud
-from jsmitsm.cloud.corners import side_normals
+from jsmitsm.cloud.corners import mean_normals, side_normals
 from jsmitsm.equation.bcs import Condition
 from jsmitsm.equation.closing import recorded_residual, recorded_values
 from jsmitsm.equation.problem import Problem
@@ -186,7 +186,7 @@ def _laid_out(problem, cloud, name, ids, conditions: list[Condition], order: int
                     raise ValueError(f"{where}: the value of field {k} is given twice; remove one of the conditions")
                 group.held[k] = component(problem, points, c.value, c.field, k, f"{where}.value")
         else:
-            normals = _normals(cloud, ids, where)
+            normals = condition_normals(cloud, ids, c, where)
             for part in _parts(problem, points, normals, c, where):
                 limit = min(order, max(highest - 1, 1))
                 top = max((sum(b) for _, b in part.slots), default=0)
@@ -216,10 +216,24 @@ def _held_by_residual(group: Group, problem: Problem) -> None:
             group.parts.remove(part)
 
 
-def _normals(cloud: Cloud, ids: np.ndarray, where: str) -> Any:
+def each_its_own(c: Condition, n: int) -> bool:
+    """Whether a condition has numbers for every one of its n particles."""
+    return any(np.ndim(c.parts[k]) > 0 and np.shape(c.parts[k])[0] == n for k in c.numbers)
+
+
+def condition_normals(cloud: Cloud, ids: np.ndarray, c: Condition, where: str) -> Any:
+    """The normals (n, D) that a condition is asked for with: at corners within a group a side's.
+
+    Slopes given by numbers or functions of x are the same on all sides, and hold for their mean; those given particle
+    by particle are for the cloud's own normals, unless they are said to be ``along`` the sides'.
+    """
     if cloud.normals is None:
         raise ValueError(f"{where}: the condition uses the normal, but the cloud has none; give Cloud(..., normals=)")
-    normals = picked(side_normals(cloud), ids)
+    if c.kind == "condition":
+        normals = side_normals(cloud)
+    else:
+        normals = mean_normals(cloud) if "along" in c.parts or not each_its_own(c, len(ids)) else cloud.normals
+    normals = picked(normals, ids)
     if not is_traced(normals) and np.isnan(np.asarray(normals)).any():
         raise ValueError(f"{where}: NaN normals in this group; give every boundary particle a unit outward normal")
     return normals

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jsmitsm as js
-from jsmitsm.cloud.corners import side_normals
+from jsmitsm.cloud.corners import mean_normals, side_normals
 
 SQUARE = [(-1, -1), (1, -1), (1, 1), (-1, 1)]
 SHAPES = {
@@ -29,19 +29,42 @@ def quadratic(x):
 @pytest.mark.parametrize("name", SHAPES)
 @pytest.mark.parametrize("kind", ["robin", "condition"])
 def test_slopes_along_a_side_hold_to_its_end(name, kind):
-    """The slope of a quadratic along the normal of every side, told without those of the corners themselves."""
+    """The slope of a quadratic along the normals that a condition is called with, or, in arrays, along the cloud's."""
     cloud = SHAPES[name]()
     slope = lambda x, n: quadratic(x) + jax.grad(quadratic)(x) @ n
     if kind == "condition":
         bc = js.condition(lambda u, x, n: u(x) + js.grad(u)(x) @ n - slope(x, n))
     else:
         ids = np.asarray(cloud.groups["boundary"])
-        bc = js.robin(1.0, 1.0, np.asarray(jax.vmap(slope)(cloud.points[ids], np.asarray(side_normals(cloud))[ids])))
+        bc = js.robin(1.0, 1.0, np.asarray(jax.vmap(slope)(cloud.points[ids], cloud.normals[ids])))
     origin = jnp.asarray(cloud.points).mean(0)
     exact = np.asarray(jax.vmap(quadratic)(cloud.points))
     sol = js.solve(js.Problem(lambda u, x: js.laplacian(u)(x) - 2 * cloud.dim, {"boundary": bc}), cloud)
     assert np.abs(sol.u - exact).max() < 1e-11 * max(np.abs(exact).max(), float(origin @ origin))
     assert not sol.flags
+
+
+@pytest.mark.parametrize("kind", ["neumann", "robin"])
+def test_slopes_that_are_the_same_on_all_sides(kind):
+    """u = |x|^2 / 2 on a square and on a cube: its slope is one on every side, and not along bisectors."""
+    for cloud in (SHAPES["square"](), js.from_sdf(js.sdf.box((-1,) * 3, (1,) * 3), ((-1,) * 3, (1,) * 3), 0.5)):
+        exact = 0.5 * (cloud.points**2).sum(axis=1)
+        bc = js.neumann(1.0) if kind == "neumann" else js.robin(1.0, 2.0, lambda x: 0.5 * (x @ x) + 2.0)
+        sol = js.solve(js.Problem(lambda u, x: js.laplacian(u)(x) - cloud.dim, {"boundary": bc}), cloud)  # noqa: B023
+        off = sol.u - exact
+        assert np.abs(off - (off.mean() if kind == "neumann" else 0.0)).max() < 1e-11
+
+
+def test_the_point_source_of_a_square():
+    """Beside a source what is left of a slope given as a number is an array, along the same normals."""
+    sources = [js.point_source(np.array([0.1, 0.2]), 1.0)]
+    problem = js.Problem(lambda u, x: js.laplacian(u)(x), {"boundary": js.robin(1.0, 1.0, 0.0)}, sources=sources)
+    sides = {"south": lambda x: x[:, 1] < -1 + 1e-9, "north": lambda x: x[:, 1] > 1 - 1e-9,
+             "west": lambda x: x[:, 0] < -1 + 1e-9, "east": lambda x: x[:, 0] > 1 - 1e-9}  # fmt: skip
+    split = js.Problem(problem.pde, dict.fromkeys(sides, js.robin(1.0, 1.0, 0.0)), sources=sources)
+    one = js.solve(problem, js.from_polygon(SQUARE, 0.1), order=6)
+    four = js.solve(split, js.from_polygon(SQUARE, 0.1, groups=sides), order=6)
+    assert np.abs(one.u - four.u).max() < 1e-4
 
 
 def test_one_group_is_as_good_as_four():
@@ -72,7 +95,7 @@ def test_smooth_boundaries_keep_their_normals():
     )
     ball = js.from_sdf(js.sdf.sphere((0, 0, 0), 1.0), ((-1,) * 3, (1,) * 3), 0.3)
     for cloud in (ellipse, stadium, lens, ball, js.interval(0, 1, 9), js.rectangle((0, 0), (1, 1), (6, 6))):
-        assert side_normals(cloud) is cloud.normals
+        assert side_normals(cloud) is cloud.normals and mean_normals(cloud) is cloud.normals
 
 
 def test_the_sides_of_a_cube_are_those_of_its_faces():

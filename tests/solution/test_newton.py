@@ -40,7 +40,7 @@ def test_expansions_that_were_kept_from_moving_are_let_go_in_the_end(finest, gro
     cloud = js.from_polygon(corners, lambda x: np.minimum(0.17, finest + growth * np.linalg.norm(x, axis=1)))
     sol = js.solve(js.Problem(lambda v, x: op(v, x) - op(u, x), {"boundary": robin}), cloud, order=8)
     assert sol.converged
-    np.testing.assert_allclose(sol.u, jax.vmap(u)(cloud.points), atol=1e-5)
+    np.testing.assert_allclose(sol.u, jax.vmap(u)(cloud.points), atol=3e-5)
 
 
 def test_continuation_returns_every_stage():

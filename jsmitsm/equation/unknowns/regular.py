@@ -10,10 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm.cloud.cloud import Cloud
-from jsmitsm.cloud.corners import side_normals
 from jsmitsm.cloud.regions.region_cloud import RegionCloud, sides
 from jsmitsm.equation.bcs import Condition
-from jsmitsm.equation.conditions import component
+from jsmitsm.equation.conditions import component, condition_normals, each_its_own
 from jsmitsm.equation.problem import Problem
 from jsmitsm.equation.regions.interface import INTERFACE
 from jsmitsm.equation.regions.per_region import members
@@ -241,12 +240,13 @@ def _regular(
         return Condition(c.kind, c.field, **rest, value=sampled("value") - there)
     if cloud.normals is None:
         return c  # refused by name later
-    normals = jnp.asarray(side_normals(cloud))[ids]
+    normals = jnp.asarray(condition_normals(cloud, ids, c, f"bcs[{name!r}]"))
+    along = {} if each_its_own(c, len(ids)) else {"along": "sides"}  # as it was asked for
     slope = of_singular(lambda singular, x, n: jax.jvp(singular.at, (x,), (n,))[1], normals)
     if c.kind == "neumann":
-        return Condition(c.kind, c.field, value=sampled("value") - slope)
+        return Condition(c.kind, c.field, value=sampled("value") - slope, **along)
     a, b = sampled("a"), sampled("b")
-    return Condition(c.kind, c.field, a=a, b=b, value=sampled("value") - a * there - b * slope)
+    return Condition(c.kind, c.field, a=a, b=b, value=sampled("value") - a * there - b * slope, **along)
 
 
 def _between(
