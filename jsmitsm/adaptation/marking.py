@@ -40,8 +40,8 @@ _ALONG, _FEW = 12.0, 5
 # From one of many there are others as bad (in parts of it) at distances between these, in its spacings; around a lone
 # one there are none.
 _AS_BAD, _FROM, _TO = 0.1, 6.0, 15.0
-# So many particles of a line are looked at together.
-_LINED = 48
+# Fewer than so many are no line, and so many particles of one are looked at together.
+_MANY, _LINED = 8, 48
 # Within so many spacings a singular point is the one of the round before.
 _SAME = 1.0
 # The error is at least the largest contribution, and random signs of many add up to this part of their root sum
@@ -154,10 +154,11 @@ def _on_lines(
     lines |= before.along[cKDTree(before.points).query(points[at])[1]]
     if before.located.any():
         lines &= cKDTree(before.points[before.located]).query(points[at])[0] > _SAME * spacing[at]
-    if lines.any():
-        alone = np.zeros(len(points), bool)
-        alone[at[~lines]] = True
-        along = some & ~alone & ~_reached(points, spacing, alone, _AFFECTED)
+    if lines.sum() < _MANY:
+        return at, along
+    alone = np.zeros(len(points), bool)
+    alone[at[~lines]] = True
+    along = some & ~alone & ~_reached(points, spacing, alone, _AFFECTED)
     return at[~lines], along
 
 

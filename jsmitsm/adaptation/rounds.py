@@ -321,9 +321,6 @@ class Rounds:
     # ------------------------------------------------------------------ the next cloud
 
     def _next(self, found: Measured, cloud: Cloud, spacing: SpacingField) -> tuple[SpacingField, Cloud] | None:
-        if self.error <= self.tol and self._unconfirmed:
-            field = spacing.scaled(_CONFIRMED)
-            return field, self._cloud(field)
         points, h = np.asarray(cloud.points), spacing(np.asarray(cloud.points))
         power, error = self._power(cloud), self.undoubted if np.isfinite(self.undoubted) else 1e3
         apart, self.apart = self.apart, None
@@ -351,6 +348,8 @@ class Rounds:
             field = better.joined(points, made_h)
         if error > LOST:
             field = along_outflow(self.data, self._cloud, field, self.max_particles // 4)
+        if self.error <= self.tol and self._unconfirmed:
+            field = spacing.scaled(_CONFIRMED)
         for attempt in range(8):
             try:
                 following = self._cloud(field)
