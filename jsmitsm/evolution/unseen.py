@@ -58,8 +58,9 @@ def unseen_start(u0: Any, values: Any, cloud: Cloud, second: bool, expanded: Cal
 
 def looker(semi: Semidiscrete) -> StateFit | None:
     """What gives states the derivatives that the equation has; None where nothing of it may jump, or have a kink."""
-    records = (semi.timed.space, semi.timed.apart, *semi.timed.masses)
-    if isinstance(semi.disc, Regions) or not any(record.kinked for record in records):
+    if isinstance(semi.disc, Regions):
+        return None
+    if not any(record.kinked for record in (semi.timed.space, semi.timed.apart, *semi.timed.masses)):
         return None
     return semi.state_fit(max((sum(b) for _, b in semi.timed.space.slots), default=0) + DEGREE)
 
