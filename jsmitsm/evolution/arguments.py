@@ -99,7 +99,7 @@ def _values(given: Any, cloud: Cloud, fields: int, name: str) -> Any:
         return _of_regions(given, cloud, fields, name)
     if callable(given):
         try:
-            values: Any = jax.vmap(lambda x: _vector(given(x), fields, name))(jnp.asarray(cloud.points))
+            values: Any = sampled(given, cloud.points, fields, name)
         except TypeError as error:
             raise ValueError(f"{name}: expected a function of x alone; calling it failed: {error}") from error
         values = values if is_traced(values) else np.array(values)
@@ -131,6 +131,11 @@ def _of_regions(given: Mapping[str, Any], cloud: Cloud, fields: int, name: str) 
         raise ValueError(f"{name}: values for the regions {list(given)}; the cloud has {known}")
     found = [_values(given[r], cloud.region(r), fields, f"{name}[{r!r}]") for r in cloud.regions]
     return spread_values(found, list(cloud.regions.values()), (len(cloud), fields))
+
+
+def sampled(given: Any, points: Any, fields: int, name: str = "u0") -> Any:
+    """A function of x at points (M, D): (M, F)."""
+    return jax.vmap(lambda x: _vector(given(x), fields, name))(jnp.asarray(points))
 
 
 def _vector(value: Any, fields: int, name: str) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -62,7 +63,8 @@ def _integrated(
     h, gamma = float(grid[1] - grid[0]) / PARTS, 1.0 - math.sqrt(0.5)
     system, nothing = high.system, np.zeros(len(high.held))
     solve, fits = system.resolvent(gamma * h).solve, looker(semi)
-    y, out = np.zeros(system.size), [np.zeros((semi.n, semi.fields))]
+    misfit = lambda t: _misfit(semi, high, steps, values, rates, float(t))  # noqa: E731
+    y, out, before = np.zeros(system.size), [np.zeros((semi.n, semi.fields))], misfit(grid[0])
     with bar("times", PARTS * (len(grid) - 1)) as shown:
         for begin in grid[:-1]:
             middle, left = float(begin) + 0.5 * PARTS * h, np.zeros(high.source.shape[0])
@@ -70,7 +72,8 @@ def _integrated(
                 u, rate = (dense_output.derivative(steps, values, middle, j) for j in range(2))
                 left = high.source.host @ left_between(semi, fits, u, [rate], middle)
             for t in begin + h * np.arange(PARTS):
-                force = gamma * h * system.force(_mean_misfit(semi, high, steps, values, rates, float(t), h) - left)
+                mean, before = _mean(misfit, before, steps, float(t), h)
+                force = gamma * h * system.force(mean - left)
                 first = system.mass(y)
                 second = system.mass(solve(first + force)) - first
                 y = solve(first + (1.0 - gamma) / gamma * second + force)
@@ -79,14 +82,17 @@ def _integrated(
     return np.stack(out)
 
 
-def _mean_misfit(
-    semi: Semidiscrete, high: Semidiscrete, steps: Any, values: Any, rates: Any, t: float, h: float
-) -> np.ndarray:
-    """The misfit between t and t + h: the mean of what it is at the run's steps in between, some of them if many."""
+def _mean(
+    misfit: Callable[[float], np.ndarray], before: np.ndarray, steps: np.ndarray, t: float, h: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """The mean of the misfit between t, where it is known, and t + h, and what it is there.
+
+    It is looked at where the run took its steps, at some of them if these are many.
+    """
     inside = steps[(steps > t + 1e-9 * h) & (steps < t + (1.0 - 1e-9) * h)]
     times = np.concatenate([[t], inside[:: -(-len(inside) // MOST) or 1], [t + h]])
-    found = np.stack([_misfit(semi, high, steps, values, rates, float(at)) for at in times])
-    return 0.5 * np.diff(times) @ (found[1:] + found[:-1]) / h
+    found = np.stack([before, *map(misfit, times[1:])])
+    return 0.5 * np.diff(times) @ (found[1:] + found[:-1]) / h, found[-1]
 
 
 def _travelled(

@@ -8,13 +8,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.cloud.regions.region_cloud import RegionCloud
 from jsmitsm.discretization.regions.layout import Regions
+from jsmitsm.evolution.arguments import sampled
 from jsmitsm.evolution.space.local_fits import StateFit
 from jsmitsm.evolution.space.semidiscrete import Semidiscrete
 from jsmitsm.particle.polynomials import monomials_on_host
@@ -42,8 +41,8 @@ def unseen_start(u0: Any, values: Any, cloud: Cloud, second: bool, expanded: Cal
     dim = cloud.dim
     far, near = _nearest(points)
     offset = 0.5 * (points[near] - points[:, None])
-    vector = lambda x: jnp.broadcast_to(jnp.asarray(u0(x), float).reshape(-1), values.shape[1:])
-    there = np.asarray(jax.vmap(jax.vmap(vector))(jnp.asarray(points[:, None] + offset)))
+    half = (points[:, None] + offset).reshape(-1, dim)
+    there = np.asarray(sampled(u0, half, values.shape[1])).reshape(*near.shape, -1)
     much = MUCH * np.abs(values).max(axis=0)
     if not (np.abs(there - 0.5 * (values[:, None] + values[near])) > much).any():
         return 0.0

@@ -6,8 +6,6 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm.adaptation.first_cloud import FIRST, cloud_of
@@ -19,7 +17,7 @@ from jsmitsm.evolution.adaptive.adapted import AdaptedEvolution
 from jsmitsm.evolution.adaptive.begun import seen, spacing_of
 from jsmitsm.evolution.adaptive.missing import Missing
 from jsmitsm.evolution.adaptive.readapt import Readapt
-from jsmitsm.evolution.arguments import starting_values
+from jsmitsm.evolution.arguments import sampled, starting_values
 from jsmitsm.evolution.evolution import Evolution
 from jsmitsm.evolution.march import march
 from jsmitsm.evolution.run import Run
@@ -147,8 +145,7 @@ class Marcher:
 
     def _everywhere(self, points: np.ndarray) -> np.ndarray:
         """The start (M, F), a function, at many points (M, D)."""
-        fields = self.problem.fields
-        return np.asarray(jax.vmap(lambda x: jnp.broadcast_to(jnp.asarray(self.u0(x), float), (fields,)))(points))
+        return np.asarray(sampled(self.u0, points, self.problem.fields))
 
     def _start(self, begin: float) -> tuple[Any, ...]:
         """Values (N, F) that the part begins with."""
