@@ -6,6 +6,8 @@ from collections.abc import Sequence
 
 # A cloud grows at most by the first factor, small ones up to so many by dimension.
 _MOST, _SMALL = 5.0, {1: 400, 2: 1500, 3: 3000}
+# Along lines, where a particle more gains least and the last round is all of the cost, by no more than this.
+_LINED = 2.5
 # One of more than so many grows at least by this factor: rounds that gain little are dear. (By as much as the last two
 # rounds say it takes is worse: where smoothness ends it takes rounds to find out, and three times the particles.)
 _LARGE, _LEAST = 4000, 1.75
@@ -16,9 +18,9 @@ _STALLED, _BETTER = 3, 0.7
 Row = tuple[int, int, float, float, float]
 
 
-def most(count: int, dim: int, allowed: int) -> float:
-    """How many particles may follow ``count``."""
-    return min(max(_MOST * count, _SMALL[dim]), allowed)
+def most(count: int, dim: int, allowed: int, lined: bool) -> float:
+    """How many particles may follow ``count``; lined: whether most of them are along lines."""
+    return min(max((_LINED if lined else _MOST) * count, _SMALL[dim]), allowed)
 
 
 def least(count: int, allowed: int) -> float:

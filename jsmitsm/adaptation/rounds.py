@@ -43,6 +43,8 @@ _GAP = 10.0
 _PARTLY = 2.0
 # Near the end of a search one aims at this part of the tolerance, if there are such points.
 _AIMED = 0.6
+# Where lines hold most particles every part of the error is dear: one aims at so many times as much as usually.
+_DEAR = 2.0
 # A number that is there at once is asked for again at this spacing. Two may differ by so many times what was thought.
 _CONFIRMED, _AGREE = 0.75, 2.0
 # Where they part, at a corner most often, that falls with this power of the spacing; by so many times what they may,
@@ -331,9 +333,11 @@ class Rounds:
         if len(cloud) >= _FULL * self.max_particles:
             self._limit(f"the {self.max_particles} particles that were allowed (max_particles)")
             return None
-        most = growth.most(len(cloud), cloud.dim, self.max_particles)
+        most = growth.most(len(cloud), cloud.dim, self.max_particles, self.lined)
         wanted = _EASED * self.tol if apart is not None else self.tol if self.error > self.tol else 0.5 * error
-        if here.singular.any() and error <= _AIMED * FAR * self.tol:  # the estimate will be doubted there, soon
+        if self.lined:
+            wanted *= _DEAR
+        elif here.singular.any() and error <= _AIMED * FAR * self.tol:  # the estimate will be doubted there, soon
             wanted *= _AIMED
         made_h, _ = next_spacing(here, power, error, wanted, most, found.gathered, found.missed)
         if apart is not None:

@@ -25,6 +25,8 @@ HISTORY = 2**29
 BLOWN = 1e30
 # An estimated error, in time or in all, above this part of the solution is a flag.
 LARGE = 0.02
+# A start of less than this part of what data make in one of so many parts of a run is one at rest.
+_REST, _PARTS = 1e-6, 64
 # Of the schemes, as ``stats`` tells them.
 NAMES = {
     "esdirk": "KenCarp4", "imex": "KenCarp4, implicit and explicit", "radau": "Radau IIA 5", "euler": "backward Euler",
@@ -176,11 +178,27 @@ def _adaptive(run: Run, y: np.ndarray, t0: float, t1: float, tol: float, history
             history.in_time.add(stepper.inner, step, t, stepper.h)
         history.add(t, step)
 
+    foreseen = _foreseen(run, stepper.inner, t0, t1)
+    least = foreseen if run.semi.system.largest(y) < _REST * foreseen else 0.0
     counts = controlled(
         stepper, y, t0, t1, tol, added, tell,
-        lambda error: _size(run, error, history.scale),
+        lambda error: _size(run, error, max(history.scale, least)),
     )  # fmt: skip
     run.counts.update(counts)
+
+
+def _foreseen(run: Run, stepper: Any, t0: float, t1: float) -> float:
+    """How large data make a solution that starts at rest: the values given, and what forces do in one of the parts.
+
+    What begins slowly, as a smooth pulse does, would have to be right to so many digits of nearly nothing.
+    """
+    system = run.semi.system
+    h, size = stepper.smallest((t1 - t0) / _PARTS), 0.0
+    for t in np.linspace(t0, t1, 1 if run.semi.timed.steady else _PARTS + 1):
+        force, _, known = stepper.drive.start(float(t))
+        moved = system.resolvent(h).solve(h * np.asarray(force))[: system.n]
+        size = max(size, system.largest(moved), system.largest(np.asarray(known)))
+    return size if np.isfinite(size) else 0.0
 
 
 class _Renewing:

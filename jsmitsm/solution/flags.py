@@ -91,7 +91,7 @@ BLIND = 1e6
 MANY = 200_000
 
 
-def flags(run: Any, values: Any, nums: Any, estimated: Callable[[], float]) -> tuple[list[str], dict[str, float]]:
+def flags(run: Any, values: Any, nums: Any, estimated: Callable[..., float]) -> tuple[list[str], dict[str, float]]:
     """Sentences, none for a healthy solution, and the measures behind them.
 
     estimated: the estimated error as a part of the solution, asked for unless the cheap tests clear the solution, which
@@ -112,7 +112,7 @@ def flags(run: Any, values: Any, nums: Any, estimated: Callable[[], float]) -> t
     blind = found.get("excess", 0.0) > BLIND or found.get("coefficient", 0.0) > DIVERGENT
     if certain or resonant or blind or hopeless(found):
         return doubts + certain, found
-    if particles(run.disc) > MANY:
+    if particles(run.disc) > MANY and np.isnan(estimated(True)):
         return doubts, found
     cleared = _cleared(run, values, found, doubts)
     if not cleared:

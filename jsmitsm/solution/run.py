@@ -389,7 +389,7 @@ class Run:
         whole = self.factor.condition()
         return health.condition_numbers(self.disc, self.nums), float(whole)
 
-    def flags(self, estimated: Callable[[], float]) -> list[str]:
+    def flags(self, estimated: Callable[..., float]) -> list[str]:
         """What speaks against the solution, in sentences; see ``jsmitsm.solution.flags``."""
         if self.values is None or self.nums is None:
             return list(self.against)

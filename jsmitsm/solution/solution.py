@@ -26,7 +26,7 @@ from jsmitsm.solution.run import Run
 class Report(Protocol):
     """What the solve can still say of itself when asked."""
 
-    def flags(self, estimated: Callable[[], float]) -> list[str]: ...
+    def flags(self, estimated: Callable[..., float]) -> list[str]: ...
 
     def condition_numbers(self) -> tuple[np.ndarray, float]: ...
 
@@ -239,8 +239,10 @@ class Solution(Anywhere):
         self._size(abs(found.error), found.units)
         return found
 
-    def _estimated(self) -> float:
-        """The estimated error over the solution, infinite where there is none."""
+    def _estimated(self, at_hand: bool = False) -> float:
+        """The estimated error over the solution, infinite where there is none; at_hand: NaN where it is not known yet."""
+        if at_hand and self._error is None:
+            return np.nan
         try:
             self.error_estimate()
         except (ValueError, SolveError) as fault:
@@ -255,9 +257,9 @@ class Solution(Anywhere):
 
         Tested when first asked for: roughness between neighbours, near singularity, an unresolved
         source or coefficient, hopeless stencils, misfits of the equation. Linear problems of one field that pass
-        by far are cleared. For all others, of up to 200,000 particles, the error is estimated: below 2 % clears what
-        is only suspected, above is a flag. Between the particles, and beyond periodic pairs, equation and data are
-        looked at too. No flag is no proof.
+        by far are cleared. For all others, of up to 200,000 particles or where it is known, the error is
+        estimated: below 2 % clears what is only suspected, above is a flag. Between the particles, and beyond
+        periodic pairs, equation and data are looked at too. No flag is no proof.
         """
         self.refuse_stacked()
         if self._found is None and self._report is not None:

@@ -33,6 +33,18 @@ def test_what_is_over_soon():
     assert 0.3 * error < told < 30 * error
 
 
+@pytest.mark.parametrize("last", [4.0, 20.0])
+def test_a_string_that_goes_on_and_on(last):
+    """The error grows for as long as it is in phase with what makes it, over sixty periods."""
+    problem = js.Problem(lambda u, x, t: js.dt(u, 2)(x) - js.laplacian(u)(x), ENDS)
+    k = 6 * np.pi
+    start = (lambda x: jnp.sin(k * x[0]), 0.0)
+    run = js.evolve(problem, js.interval(0.0, 1.0, 41), start, t=(0.0, last), tol=1e-4, order=6)
+    exact = np.sin(k * run.cloud.points[:, 0]) * np.cos(k * last)
+    ratio = float(run.error_estimate()[-1].max()) / np.abs(run.u[-1] - exact).max()
+    assert 0.8 < ratio < 1.25
+
+
 @pytest.mark.parametrize("n", [21, 31, 51])
 def test_a_start_that_jumps(n):
     """A hot disk in an insulated box: at the end its heat is spread evenly, what the particles have of it."""

@@ -8,8 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
-from jsmitsm.linear import backends, factor_cache, linsolve, solver_choice, sparse
+from jsmitsm.linear import backends, factor_cache, linsolve, ordering, solver_choice, sparse
 from jsmitsm.linear.linsolve import SingularMatrix, factor, factorisations, solve
 from jsmitsm.linear.ordering import nested_dissection
 from jsmitsm.runtime.errors import SolveError
@@ -322,6 +323,26 @@ def test_separators_separate():
     last = 1024 - 33  # a column of the lattice, and a little for the jitter
     crossing = [np.sum((low < k) & (high >= k) & (high < last)) for k in range(300, 700)]
     assert min(crossing) == 0
+
+
+@pytest.mark.parametrize("dim, finest, most", [(2, 9, 0.6), (3, 6, 0.85)])
+def test_cuts_go_across_what_is_graded(monkeypatch, dim, finest, most):
+    """Layers towards a wall, each with half the spacing of the one before: most particles are along the wall."""
+    rng = np.random.default_rng(4)
+    layers = []
+    for level in range(2, finest):
+        h = 0.5**level
+        middles = [h * (np.arange(2**level) + 0.5)] * (dim - 1)
+        layers.append(np.stack(np.meshgrid([1.25 * h, 1.75 * h], *middles), -1).reshape(-1, dim))
+        layers[-1] += 0.1 * h * rng.uniform(-1, 1, layers[-1].shape)
+    points = np.concatenate(layers)
+    n, k = len(points), 6 * dim
+    rows, cols = np.repeat(np.arange(n), k), cKDTree(points).query(points, k)[1].ravel()
+    data = np.where(rows == cols, float(k), -rng.uniform(size=n * k))
+    graded = factor(data, rows, cols, n, points, "sparse").info["factor_entries"]
+    monkeypatch.setattr(ordering, "_FEWER", 0.0)
+    linsolve.clear_cache()
+    assert graded < most * factor(data, rows, cols, n, points, "sparse").info["factor_entries"]
 
 
 def test_order_saves_fill_in():

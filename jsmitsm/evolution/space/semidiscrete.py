@@ -287,6 +287,8 @@ class Semidiscrete:
                     entries.append((jac[e, s], places + e, places + k))
                 else:
                     entries.append((jac[e, s][d.rows] * d.values, d.rows * self.fields + e, d.cols * self.fields + k))
+        if not entries:  # as of u^3 where u is zero
+            return sparse.csr_array((self.source.host.shape[0], len(self.free)))
         values, rows, cols = (np.concatenate(v) for v in zip(*entries))
         # A partner's value is its lender's.
         lender = (self.disc.partner[:, None] * self.fields + np.arange(self.fields)).reshape(-1)

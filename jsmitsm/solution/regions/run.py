@@ -189,7 +189,7 @@ class RegionsRun(Run):
             out[part.ids] = health.condition_numbers(part.disc, own)
         return out, float(self.factor.condition())
 
-    def flags(self, estimated: Callable[[], float]) -> list[str]:
+    def flags(self, estimated: Callable[..., float]) -> list[str]:
         """What speaks against the solution: the tests of each region, and those of the whole system."""
         if self.values is None or self.nums is None:
             return list(self.against)
