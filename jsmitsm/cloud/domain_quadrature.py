@@ -8,17 +8,18 @@ around it.
 
 from __future__ import annotations
 
-import math
-from typing import NamedTuple
+from collections.abc import Callable
 
 import numpy as np
 
 from jsmitsm.cloud.cloud import Cloud
+from jsmitsm.cloud.integrals.edges import SMOOTH, open_ways, over_edges
+from jsmitsm.cloud.integrals.swept import Swept, simplex_rule
 from jsmitsm.cloud.triangulation import boundary_facets, lying_on, normals_of, simplices
 from jsmitsm.taylor.multi_indices import multi_indices
 
-# A particle's normal counts at a facet if it is within 30 degrees of the facet's own; beyond, there is a corner.
-SMOOTH = math.cos(math.radians(30.0))
+# Points (Q, D), their normals (Q, D), and whether most corners of their facet are of a group: which of them (Q,) are it.
+Members = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 _STEPS = 8
 # Heights over a facet, in sizes of its surroundings, and differences of normals, that are round-off.
 _FLAT = 1e-9
@@ -29,32 +30,13 @@ _FAR, _STEEP = 0.5, 0.1
 def domain_rule(cloud: Cloud, degree: int) -> tuple[np.ndarray, np.ndarray]:
     """Points (Q, D) and weights (Q,) for integrals over the domain of functions that polynomials of a degree follow."""
     points = np.asarray(cloud.points, float)
-    at, weights = _simplex_rule(cloud.dim, degree // 2 + 1)
+    at, weights = simplex_rule(cloud.dim, degree // 2 + 1)
     corners = points[simplices(cloud)]
     sides = corners[:, 1:] - corners[:, :1]
     volume = np.abs(np.linalg.det(sides))
     inner = np.einsum("qk,mkd->mqd", at, corners), volume[:, None] * weights
     parts = [inner] if cloud.dim == 1 else [inner, _layers(cloud, degree)]
     return tuple(np.concatenate([part[k].reshape(-1, *part[k].shape[2:]) for part in parts]) for k in (0, 1))  # type: ignore
-
-
-class _Swept(NamedTuple):
-    """Ways from Gauss points of facets to the boundary, along the particles' normals, interpolated."""
-
-    base: np.ndarray  # (M, Q, D) on the facets
-    way: np.ndarray  # (M, Q, D)
-    reach: np.ndarray  # (M, Q), how many ways it is to the boundary
-    weights: np.ndarray  # (Q,)
-    sides: np.ndarray  # (M, D - 1, D) of the facets
-    turns: np.ndarray  # (M, D - 1, D), by which the ways change along them
-    handed: np.ndarray  # (M, 1), the sign that makes volumes on the outward side of a facet positive
-    outward: np.ndarray  # (M, Q, D) unit normals where the ways end
-
-    def at(self, share: float) -> tuple[np.ndarray, np.ndarray]:
-        """Where (M, Q, D) a share of the ways is gone, and the volume (M, Q) that a unit of them sweeps there."""
-        along = self.sides[:, None] + (share * self.reach)[..., None, None] * self.turns[:, None]
-        volume = np.linalg.det(np.concatenate([along, self.way[:, :, None]], axis=2)) * self.handed
-        return self.base + (share * self.reach)[..., None] * self.way, volume * self.weights
 
 
 def surface_rule(
@@ -90,7 +72,7 @@ def _swept(cloud: Cloud, facets: np.ndarray, normal: np.ndarray, degree: int) ->
     own = normals_of(cloud)[facets]
     ways = np.where((np.sum(own * flat, axis=2) >= SMOOTH)[..., None], own, flat)
     # An even number: the middle of a side is as near to one particle as to the other, whose polynomials differ there.
-    at, weights = _simplex_rule(cloud.dim - 1, 2 * (degree // 4 + 1))
+    at, weights = simplex_rule(cloud.dim - 1, 2 * (degree // 4 + 1))
     base, way = (np.einsum("qk,mkd->mqd", at, x) for x in (corners, ways))
     # Where the shape is known the graph is the start of the way there only.
     graph = _graphs(cloud, corners, facets, normal, degree if cloud._shape is None else min(degree, 4))
@@ -172,17 +154,3 @@ def _to_shape(
     good = ((np.abs(miss) < near) & (steep > 0.1) & (np.abs(t - reach) < 0.3 * width)).all(axis=1, keepdims=True)
     t, outward = np.where(good, t, reach), np.where(good[..., None], own, outward)
     return np.where(straight, 0.0, t), np.where(straight[..., None], normal[:, None], outward)
-
-
-def _simplex_rule(dim: int, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Gauss points as barycentric coordinates (Q, dim + 1) in a simplex, collapsed from a cube, and weights."""
-    x, w = np.polynomial.legendre.leggauss(count + (dim > 1))
-    x, w = (x + 1.0) / 2.0, w / 2.0
-    grid = np.stack([v.ravel() for v in np.meshgrid(*[x] * dim, indexing="ij")], axis=1)
-    weight = np.prod(np.stack([v.ravel() for v in np.meshgrid(*[w] * dim, indexing="ij")], axis=1), axis=1)
-    left, at = np.ones(len(grid)), []
-    for k in range(dim):
-        at.append(left * grid[:, k])
-        weight = weight * left if k else weight
-        left = left * (1.0 - grid[:, k])
-    return np.stack([*at, left], axis=1), weight

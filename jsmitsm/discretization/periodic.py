@@ -10,9 +10,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jsmitsm.cloud.cloud import Cloud
+from jsmitsm.cloud.cloud import INTERIOR, Cloud
 from jsmitsm.equation.problem import Problem
 from jsmitsm.runtime.tracers import is_traced
+
+# A particle and the copy of another nearer than this part of the translation are the same.
+_SAME = 1e-8
 
 
 @dataclass(frozen=True)
@@ -55,11 +58,12 @@ class Images:
         return np.concatenate([np.arange(self.n), self.owner, [-1]])[index]
 
 
-def periodic_images(problem: Problem, cloud: Cloud) -> tuple[Images, np.ndarray]:
+def periodic_images(problem: Problem, cloud: Cloud, given: np.ndarray) -> tuple[Images, np.ndarray]:
     """The images that the problem's periodic pairs call for, and every particle's partner.
 
     The particles of a pair's second group take the values of their partners in the first and
-    carry no equation. Raises ValueError where the groups are no translated copies.
+    carry no equation. given (N,): those whose values conditions hold, which lend and do not take.
+    Raises ValueError where the groups are no translated copies.
     """
     n = len(cloud)
     partner = np.arange(n)
@@ -76,6 +80,7 @@ def periodic_images(problem: Problem, cloud: Cloud) -> tuple[Images, np.ndarray]
         shifts.append(shift)
         partner[cloud.groups[second]] = cloud.groups[first][match]
     partner = partner[partner]  # a corner may be an image of an image
+    partner = _with_corners_met(partner, points, cloud, shifts, given)
     own = np.flatnonzero(partner == np.arange(n))
     owner, moved = [], []
     for steps in product((-1, 0, 1), repeat=len(shifts)):
@@ -83,6 +88,40 @@ def periodic_images(problem: Problem, cloud: Cloud) -> tuple[Images, np.ndarray]
             owner.append(own)
             moved.append(np.broadcast_to(np.array(steps) @ np.array(shifts), (len(own), cloud.dim)))
     return Images(n, np.concatenate(owner), np.concatenate(moved), np.flatnonzero(partner != np.arange(n))), partner
+
+
+def _with_corners_met(
+    partner: np.ndarray, points: np.ndarray, cloud: Cloud, shifts: list[np.ndarray], given: np.ndarray
+) -> np.ndarray:
+    """The partners, of particles too on which the copy of another falls though no pair names them.
+
+    A corner belongs to one side, so that the pair of the other sides misses it. Left with an equation of its own it
+    would state that of its copy once more: two rows of a collocation that are the same.
+    """
+    from scipy.spatial import cKDTree
+
+    partner, own = partner.copy(), partner == np.arange(len(points))
+    sides = [members for name, members in cloud.groups.items() if name != INTERIOR]
+    ids = np.unique(np.concatenate(sides).astype(int))
+    ids = ids[own[ids]]
+    tree = cKDTree(points[ids])
+
+    def lender(i: int) -> int:
+        while partner[i] != i:
+            i = partner[i]
+        return i
+
+    for shift in shifts:
+        distance, near = tree.query(points[ids] + shift)
+        for k in np.flatnonzero(distance <= _SAME * np.linalg.norm(shift)):
+            one, other = lender(ids[k]), lender(ids[near[k]])
+            if given[other]:
+                one, other = other, one
+            if not given[other]:
+                partner[other] = one
+    while (partner[partner] != partner)[ids].any():
+        partner[ids] = partner[partner[ids]]
+    return partner[partner]
 
 
 def with_corners(problem: Problem, cloud: Cloud) -> Cloud:
@@ -143,7 +182,7 @@ def _matched(points: np.ndarray, cloud: Cloud, first: str, second: str) -> tuple
     shift = b.mean(axis=0) - a.mean(axis=0) if len(a) == len(b) else b[0] - a[0]
     size = np.linalg.norm(shift)
     distance, match = cKDTree(a + shift).query(b)
-    if len(a) != len(b) or distance.max() > 1e-8 * size or len(np.unique(match)) != len(b):
+    if len(a) != len(b) or distance.max() > _SAME * size or len(np.unique(match)) != len(b):
         raise ValueError(
             f"periodic: the groups {first!r} ({len(a)} particles) and {second!r} ({len(b)}) are no translation "
             "of each other (congruent, one for one); give both the same number of particles, one for one"

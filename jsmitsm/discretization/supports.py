@@ -42,6 +42,10 @@ def default_size(scheme: Scheme, even: bool = False) -> int:
     three times smaller; elsewhere, and at high orders near boundaries, too many of them would be weak.
     """
     free, rec = scheme_size(scheme), scheme.rec
+    if rec.dim == 1 and scheme.method == "SSPH":
+        # Polynomials through all neighbours: of more of them the errors were ten times larger, of twice as many
+        # as there are coefficients a hundred thousand times.
+        return max(free, 5)
     if rec.dim == 1 and rec.fields == 1:
         return min(2 * free + 2, 5)
     ratio = _EVEN_RATIO.get(rec.order, 2.0) if even else 2.0

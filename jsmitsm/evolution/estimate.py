@@ -1,4 +1,4 @@
-"""The error of an evolution in space: what a pencil of two orders more makes of the same rates."""
+"""The error of an evolution: what a pencil of two orders more makes of the same rates, and where errors of steps go."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ from jsmitsm.evolution.run import Run
 from jsmitsm.evolution.space.semidiscrete import Semidiscrete
 from jsmitsm.evolution.space.system import System
 from jsmitsm.evolution.steps import dense_output
-from jsmitsm.evolution.steps.stepping import RadauStepper
-from jsmitsm.evolution.steps.tableaux import RADAU
+from jsmitsm.evolution.steps.newton import Newton
+from jsmitsm.evolution.steps.stepping import RadauStepper, Stepper
+from jsmitsm.evolution.steps.tableaux import KENCARP4, RADAU
 from jsmitsm.evolution.unseen import left_between, looker
 from jsmitsm.runtime.progress import PENCIL, bar
 from jsmitsm.taylor.multi_indices import HIGHEST
@@ -25,49 +26,61 @@ LOOKS, PARTS, MOST = 10, 4, 4
 
 @bar("error estimate", parts=(*PENCIL, ("times", 4.0)))
 def in_space(
-    run: Run, history: tuple[np.ndarray, np.ndarray], rates: np.ndarray | None
-) -> tuple[np.ndarray, np.ndarray]:
+    run: Run, history: tuple[np.ndarray, np.ndarray], rates: np.ndarray | None, lumps: list[tuple[float, np.ndarray]]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Times (K + 1,), and estimated errors w - u (K + 1, N, F) at them: A' w = B' f + Bg' g, f = -(M u' + N).
 
     Dashes are of order p + 2. What the rates leave over drives the error, from zero at the start. history: times and
     values of the steps; rates: theirs, of second order in time. Zero where nothing is known: quasilinear problems.
+    The third is where the errors of steps, lumps (size,) at times, have gone on the way, where that is known.
     """
     semi, (steps, values) = run.semi, history
     if len(steps) < 2 or run.timed.quasilinear or run.order + 2 > HIGHEST:
-        return steps[[0, -1]], np.zeros((2, semi.n, semi.fields))
+        return steps[[0, -1]], *np.zeros((2, 2, semi.n, semi.fields))
     grid = np.linspace(steps[0], steps[-1], min(LOOKS, len(steps) - 1) + 1)
     # Pairs of fields that drive one another are the ones that are damped.
-    integrated = _travelled if semi.second else _summed if run.damping else _integrated
-    errors = integrated(semi, run.finer(), steps, values, rates, grid)
-    errors.reshape(len(grid), -1)[:, semi.held] = 0.0
-    return grid, errors
+    if semi.second or run.damping:
+        integrated = _travelled if semi.second else _summed
+        errors = integrated(semi, run.finer(), steps, values, rates, grid)
+        carried = np.zeros_like(errors)
+    else:
+        errors, carried = _integrated(semi, run.finer(), steps, values, rates, grid, lumps)
+    for each in (errors, carried):
+        each.reshape(len(grid), -1)[:, semi.held] = 0.0
+    return grid, errors, carried
 
 
 def estimated(
-    run: Run, times: np.ndarray, grid: np.ndarray, errors: np.ndarray, in_time: np.ndarray
+    run: Run, times: np.ndarray, grid: np.ndarray, errors: np.ndarray, carried: np.ndarray, in_time: np.ndarray
 ) -> np.ndarray:
-    """The sizes of errors (S, N, F) at the times: of those in space at a grid, and in_time (S,), what steps add."""
-    errors = np.abs(errors)
+    """The sizes of errors (S, N, F) at the times: of those in space at a grid, and of what steps add.
+
+    carried: that, at the grid, where it is known where it has gone; in_time (S,): how much of it is known to be there.
+    """
     index = np.clip(np.searchsorted(grid, times), 1, len(grid) - 1)
     part = ((times - grid[index - 1]) / np.maximum(grid[index] - grid[index - 1], 1e-300))[:, None, None]
-    out = (1.0 - part) * errors[index - 1] + part * errors[index] + in_time[:, None, None]
+    space, steps = ((1.0 - part) * e[index - 1] + part * e[index] for e in (np.abs(errors), np.abs(carried)))
+    out = space + np.maximum(steps, in_time[:, None, None])
     out.reshape(len(times), -1)[1:, run.semi.held] = 0.0
     return out
 
 
 def _integrated(
-    semi: Semidiscrete, high: Semidiscrete, steps: Any, values: Any, rates: Any, grid: np.ndarray
-) -> np.ndarray:
-    """Errors (K + 1, N, F) at equidistant times: E e' + A e = misfit from e = 0.
+    semi: Semidiscrete, high: Semidiscrete, steps: Any, values: Any, rates: Any, grid: np.ndarray,
+    lumps: list[tuple[float, np.ndarray]],
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Errors (K + 1, N, F) in space and in time at equidistant times: E e' + A e + B N'(u) e = misfit, from e = 0.
 
-    By the diagonally implicit method of two stages and second order, which damps what is stiff and lets grow what does
-    (Alexander, SIAM J. Numer. Anal. 14, 1977). The misfit is its mean over a step: much of it may be over soon.
+    Those in time are driven by the errors of the steps, lumps (size,) where they were made. By the diagonally implicit
+    method of two stages and second order, which damps what is stiff and lets grow what does (Alexander, SIAM J. Numer.
+    Anal. 14, 1977). The misfit is its mean over a step: much of it may be over soon.
     """
     h, gamma = float(grid[1] - grid[0]) / PARTS, 1.0 - math.sqrt(0.5)
     system, nothing = high.system, np.zeros(len(high.held))
-    solve, fits = system.resolvent(gamma * h).solve, looker(semi)
+    solve, fits = _around(semi, high, steps, values, gamma * h), looker(semi)
     misfit = lambda t: _misfit(semi, high, steps, values, rates, float(t))  # noqa: E731
-    y, out, before = np.zeros(system.size), [np.zeros((semi.n, semi.fields))], misfit(grid[0])
+    y, before = np.zeros((system.size, 2)), misfit(grid[0])
+    out = [np.zeros((semi.n, semi.fields, 2))]
     with bar("times", PARTS * (len(grid) - 1)) as shown:
         for begin in grid[:-1]:
             middle, left = float(begin) + 0.5 * PARTS * h, np.zeros(high.source.shape[0])
@@ -76,13 +89,24 @@ def _integrated(
                 left = high.source.host @ left_between(semi, fits, u, [rate], middle)
             for t in begin + h * np.arange(PARTS):
                 mean, before = _mean(misfit, before, steps, float(t), h)
-                force = gamma * h * system.force(mean - left)
+                made = sum((e for at, e in lumps if t < at - 1e-9 * h <= t + h), np.zeros(system.size))
+                force = gamma * np.stack([h * (mean - left), system.mass(made)], axis=-1)
                 first = system.mass(y)
-                second = system.mass(solve(first + force)) - first
-                y = solve(first + (1.0 - gamma) / gamma * second + force)
+                second = system.mass(solve(first + force, t + gamma * h)) - first
+                y = solve(first + (1.0 - gamma) / gamma * second + force, t + h)
                 shown.update(1)
-            out.append(high.placed(y[: system.n], nothing))
-    return np.stack(out)
+            out.append(np.stack([high.placed(column, nothing) for column in y.T], axis=-1))
+    space, time = np.moveaxis(np.stack(out), -1, 0)
+    return space, time
+
+
+def _around(semi: Semidiscrete, high: Semidiscrete, steps: Any, values: Any, g: float) -> Callable[..., np.ndarray]:
+    """Solves (E + g (A + B N'(u))) y = r (n, m) at a time: errors go on as small changes of the run do."""
+    if semi.linear:
+        solve = high.system.resolvent(g).solve
+        return lambda r, t: solve(r)
+    newton = Newton(high)
+    return lambda r, t: newton.around(r, dense_output.derivative(steps, values, float(t), 0), float(t), g)
 
 
 def _mean(
@@ -101,15 +125,22 @@ def _mean(
 def _travelled(
     semi: Semidiscrete, high: Semidiscrete, steps: Any, values: Any, rates: Any, grid: np.ndarray
 ) -> np.ndarray:
-    """The same of second order in time, by Radau IIA in as many steps as the run took.
+    """The same of second order in time, by the scheme of the run in as many steps.
 
     Nothing dies out, and what is left over travels with the error that it makes, which grows all the way as long as
     both are in phase: a method of low order would lose that long before the run does.
     """
     many = -(-(len(steps) - 1) // (len(grid) - 1))
     h = float(grid[1] - grid[0]) / many
-    left = _LeftOver(high.system, lambda t: _misfit(semi, high, steps, values, rates, t))
-    stepper, nothing = RadauStepper(high.system, left), np.zeros(len(high.held))
+    scheme = RADAU if semi.linear else KENCARP4
+    left = _LeftOver(high.system, lambda t: _misfit(semi, high, steps, values, rates, t), scheme.nodes)
+
+    def driven(y: np.ndarray, t: float, known: Any) -> np.ndarray:
+        slope = high.linearised(high.steepness(dense_output.derivative(steps, values, t, 0), t))
+        return -high.system.force(slope @ y[: high.system.n])
+
+    stepper: Any = RadauStepper(high.system, left) if semi.linear else Stepper(high.system, left, KENCARP4, driven)
+    nothing = np.zeros(len(high.held))
     now, out = stepper.first(np.zeros(high.system.size), float(grid[0])), [np.zeros((semi.n, semi.fields))]
     with bar("times", many * (len(grid) - 1)) as shown:
         for begin in grid[:-1]:
@@ -121,16 +152,16 @@ def _travelled(
 
 
 class _LeftOver:
-    """Drives a system by a misfit (n,) of the time; the held particles stay at zero."""
+    """Drives a system by a misfit (n,) of the time, at the stages of a scheme; the held particles stay at zero."""
 
-    def __init__(self, system: System, misfit: Callable[[float], np.ndarray]):
-        self.system, self.misfit = system, misfit
+    def __init__(self, system: System, misfit: Callable[[float], np.ndarray], nodes: np.ndarray):
+        self.system, self.misfit, self.nodes = system, misfit, nodes[nodes > 0]
 
     def start(self, t: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         return self.system.force(self.misfit(t)), np.zeros(self.system.size), np.zeros(0)
 
     def step(self, t: float, h: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        forces = np.stack([self.system.force(self.misfit(t + float(c) * h)) for c in RADAU.nodes])
+        forces = np.stack([self.system.force(self.misfit(t + float(c) * h)) for c in self.nodes])
         return forces, np.zeros_like(forces), np.zeros((len(forces), 0))
 
 
@@ -156,7 +187,7 @@ def _misfit(semi: Semidiscrete, high: Semidiscrete, steps: Any, values: Any, rat
     held, conditions, source, *_ = (np.asarray(v) for v in high.sample(at))
     u = dense_output.derivative(steps, values, t, 0)
     if not semi.linear:
-        source = source + np.asarray(semi.nonlinear(semi.slot_values(u), at, semi.params))
+        source = source + np.asarray(high.nonlinear(high.slot_values(u), at, high.params))
     for j in range(1, 3 if semi.second else 2):
         rate = dense_output.derivative(steps, values if rates is None else rates, t, j - (rates is not None))
         mass = semi.timed.mass(j, np.asarray(semi.points), (at, semi.params))

@@ -19,7 +19,7 @@ from jsmitsm.evolution.regions.run import RegionsRun
 from jsmitsm.evolution.regions.timed import regions_timed
 from jsmitsm.evolution.run import Run
 from jsmitsm.evolution.space.timed import timed
-from jsmitsm.evolution.unseen import DEGREE, unseen_start
+from jsmitsm.evolution.unseen import unseen_start
 from jsmitsm.runtime.arrays import ValueOrFunction
 from jsmitsm.runtime.errors import explaining, short
 from jsmitsm.runtime.progress import PENCIL, bar
@@ -182,7 +182,7 @@ def evolve(
     # Measured with 1,000 and 8,000 particles: a step takes about as long as one of the fits; with tol some forty do.
     with bar("evolve", wanted=progress, parts=(*PENCIL, ("steps", float(40 if steps is None else steps)))):
         run = (RegionsRun if several else Run)(made, cloud, start, t, began, **options)
-        run.unseen = unseen_start(u0, start[0], cloud, second, lambda u: run.semi.state_fit(DEGREE).coefficients(u))
+        run.unseen = unseen_start(u0, start[0], cloud, run.semi)  # type: ignore[arg-type]
         if run.traced:
             if steps is None:
                 raise ValueError(

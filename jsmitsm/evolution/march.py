@@ -42,7 +42,7 @@ class History:
         self.states: list[np.ndarray] = []
         self.rates: list[np.ndarray] = []
         self.scale, self.first = 0.0, 0.0
-        self.in_time = InTime()
+        self.in_time = InTime(*(float(v) for v in run.t))
 
     def add(self, t: float, step: Step, number: int | None = None) -> None:
         semi = self.run.semi
@@ -255,7 +255,8 @@ def _finished(run: Run, parts: np.ndarray, history: History, fault: str, began: 
     kept = np.array(history.times), np.stack(history.states)
     moved = np.stack(history.rates) if history.rates else None
 
-    known = cache(lambda: in_space(run, kept, moved))
+    lumps = list(history.in_time.parts.values())
+    known = cache(lambda: in_space(run, kept, moved, lumps))
 
     def estimate() -> np.ndarray:
         sampled = run.unseen * np.abs(states).reshape(len(states), -1).max(axis=1)

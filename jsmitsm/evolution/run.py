@@ -70,6 +70,11 @@ class Run:
                 'scheme: "imex" takes what is nonlinear explicitly, and here the highest derivatives are nonlinear or '
                 'their coefficients depend on t; use "esdirk"'
             )
+        if asked == "imex" and self.algebraic and not timed.linear:
+            raise ValueError(
+                'scheme: "imex" takes what is nonlinear explicitly, which an equation without a rate cannot wait for; '
+                'use "esdirk"'
+            )
         if self.second and not timed.linear and asked in ("esdirk", "euler"):
             raise ValueError(
                 f'scheme: {asked!r} solves linear problems of second order in time; use "imex", or write two fields of '

@@ -5,13 +5,15 @@ No order tells, and of the start no later time: what was not sampled is not carr
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.cloud.regions.region_cloud import RegionCloud
+from jsmitsm.cloud.sight.walls import nearest_seen
+from jsmitsm.discretization.layout import Discretization
 from jsmitsm.discretization.regions.layout import Regions
 from jsmitsm.evolution.arguments import sampled
 from jsmitsm.evolution.space.local_fits import StateFit
@@ -27,19 +29,19 @@ DEGREE, MUCH = 4, 0.1
 LARGE = 0.2
 
 
-def unseen_start(u0: Any, values: Any, cloud: Cloud, second: bool, expanded: Callable[[Any], Any]) -> float:
+def unseen_start(u0: Any, values: Any, cloud: Cloud, semi: Semidiscrete) -> float:
     """The part of the start, a function of x with ``values`` (N, F) at the particles, that these do not see.
 
-    expanded: the local polynomials (N, F, K) of values, of degree ``DEGREE``. Halfway to the nearest neighbours they
-    are compared with it. Those that differ by much are taken to be off by chance, each for the volume that it has: in a
-    sum over the domain the squares add up. Zero for arrays, in several regions, and where JAX traces.
+    The local polynomials of the values are compared with it halfway to the nearest neighbours. Those that differ by
+    much are taken to be off by chance, each for the volume that it has: in a sum over the domain the squares add up.
+    Zero for arrays, in several regions, and where JAX traces.
     """
-    u0 = u0[0] if second and isinstance(u0, (tuple, list)) else u0
+    u0 = u0[0] if semi.second and isinstance(u0, (tuple, list)) else u0
     if not callable(u0) or isinstance(cloud, RegionCloud) or len(cloud) < 3 or is_traced(values, cloud):
         return 0.0
     values, points = np.asarray(values), np.asarray(cloud.points)
     dim = cloud.dim
-    far, near = _nearest(points)
+    near, count = _nearest(semi.disc)
     offset = 0.5 * (points[near] - points[:, None])
     half = (points[:, None] + offset).reshape(-1, dim)
     there = np.asarray(sampled(u0, half, values.shape[1])).reshape(*near.shape, -1)
@@ -47,9 +49,9 @@ def unseen_start(u0: Any, values: Any, cloud: Cloud, second: bool, expanded: Cal
     if not (np.abs(there - 0.5 * (values[:, None] + values[near])) > much).any():
         return 0.0
     powers = monomials_on_host(offset.reshape(-1, dim).T, DEGREE).T.reshape(*near.shape, -1)
-    away = there - np.einsum("nkt,nft->nkf", powers, np.asarray(expanded(values)))
-    away = np.where(np.abs(away) > much, away, 0.0).sum(axis=1) / (1 + near.shape[1])
-    volume = far.mean(axis=1) ** dim
+    away = there - np.einsum("nkt,nft->nkf", powers, np.asarray(semi.state_fit(DEGREE).coefficients(values)))
+    away = np.where(np.abs(away) > much, away, 0.0).sum(axis=1) / (1 + count)[:, None]
+    volume = (2.0 * np.linalg.norm(offset, axis=2).sum(axis=1) / np.maximum(count, 1)) ** dim
     whole = np.abs(values).T @ volume
     part = np.sqrt(np.square(away * volume[:, None]).sum(axis=0)) / np.where(whole > 0, whole, np.inf)
     return float(part.max(initial=0.0))
@@ -84,17 +86,21 @@ def left_between(
             found = found + np.einsum("nef,nf->ne", semi.timed.mass(j, x, at), rate)
         return found
 
-    near = _nearest(points)[1]
+    near, count = _nearest(semi.disc)
     own, total = residual(points), np.zeros((len(points), semi.fields))
     for other in near.T:
         there = residual(points[other])
         away = residual(0.5 * (points + points[other])) - 0.5 * (own + there)
         total += np.where(np.abs(away) > LARGE * np.abs(there - own).max(axis=0), away, 0.0)
-    return (total / (1 + near.shape[1])).reshape(-1)
+    return (total / (1 + count)[:, None]).reshape(-1)
 
 
-def _nearest(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The distances (N, k) of the nearest neighbours, two along each axis, and who they are."""
-    from scipy.spatial import cKDTree
+def _nearest(disc: Discretization) -> tuple[np.ndarray, np.ndarray]:
+    """The nearest neighbours (N, k) that particles see, two along each axis, and how many (N,) there are.
 
-    return cKDTree(points).query(points, k=range(2, min(2 * points.shape[1] + 1, len(points)) + 1))
+    Across a gap there is none: halfway to it lies no part of the domain. For want of one a particle is its own.
+    """
+    points = np.asarray(disc.cloud.points, float)
+    size = min(2 * points.shape[1] + 1, len(points))
+    near = np.asarray(nearest_seen(points, size, None, disc.walls).indices)[:, 1:size]
+    return np.where(near >= 0, near, np.arange(len(points))[:, None]), (near >= 0).sum(axis=1)

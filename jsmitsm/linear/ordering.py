@@ -130,7 +130,7 @@ def _halve(points: np.ndarray, reach: np.ndarray | None = None) -> tuple[np.ndar
 
 
 def _beside(x: np.ndarray, reach: np.ndarray, first: np.ndarray, half: np.ndarray, region: np.ndarray) -> np.ndarray:
-    """How many unknowns are beside a cut in half of every region; x, reach (n,): sorted in the regions from ``first``."""
+    """How many unknowns are beside a cut of every region in half; x, reach (n,): sorted in those from ``first``."""
     above = x - x[first + half][region]
     return np.add.reduceat((above >= 0) & (above < _BESIDE * reach), first, dtype=np.int64)
 

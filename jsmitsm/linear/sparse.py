@@ -150,7 +150,7 @@ class Factor:
         return x.reshape(b.shape)
 
     def plain(self, b: np.ndarray, transpose: bool = False) -> np.ndarray:
-        """``solve`` for one of many finite right-hand sides (n,): residuals are looked at of the first alone.
+        """``solve`` for one of many finite right-hand sides (n,) or (n, m): residuals are looked at of the first alone.
 
         A direct solver that has solved one backward stably solves all; iterative ones are looked at every time.
         """
@@ -159,9 +159,9 @@ class Factor:
             self._trusted[transpose] = bool(b.any())
             return x
         before, after = (self.col_scale, self.row_scale) if transpose else (self.row_scale, self.col_scale)
-        right = before * b
-        x = self._lu.apply((right if self.order is None else right[self.order])[:, None], transpose)
-        return after * self._in_callers_order(x[:, 0])
+        right = before[:, None] * b.reshape(self.n, -1)
+        x = self._lu.apply(right if self.order is None else right[self.order], transpose)
+        return (after[:, None] * self._in_callers_order(x)).reshape(b.shape)
 
     def condition(self) -> float:
         """Condition number in the 1-norm, of the matrix with rows and columns scaled to about one.
@@ -325,6 +325,7 @@ class Factor:
         except RuntimeError:
             return []
         return _largest(self._in_callers_order(near_null_vector(backend.apply, self.n)))
+
 
 def _scales(
     data: np.ndarray, rows: np.ndarray, cols: np.ndarray, n: int, columns: bool

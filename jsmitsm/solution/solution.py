@@ -240,7 +240,7 @@ class Solution(Anywhere):
         return found
 
     def _estimated(self, at_hand: bool = False) -> float:
-        """The estimated error over the solution, infinite where there is none; at_hand: NaN where it is not known yet."""
+        """The estimated error over the solution, infinite where there is none; at_hand: NaN where nobody asked yet."""
         if at_hand and self._error is None:
             return np.nan
         try:

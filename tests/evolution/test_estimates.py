@@ -22,6 +22,40 @@ def test_what_grows(rate, waves):
     assert 0.5 < ratio < 2.0
 
 
+RATES = {
+    "square": lambda u, x, t: 4.0 * u(x) ** 2,
+    "in time": lambda u, x, t: 8.0 * (1.0 + 0.5 * jnp.sin(t)) * u(x),
+    "convection": lambda u, x, t: 5.0 * u(x) - 0.3 * u(x) * js.grad(u)(x)[0],
+}
+
+
+@pytest.mark.parametrize("name", RATES)
+@pytest.mark.parametrize("scheme", ["imex", "esdirk"])
+def test_what_grows_by_a_reaction(name, scheme):
+    """Errors go on as small changes of the run do, which what is nonlinear drives too."""
+    cloud = js.interval(0.0, 1.0, 33)
+    exact = lambda x, t: 1.0 + 0.5 * jnp.cos(2 * jnp.pi * x[0]) * jnp.cos(t)
+    made = lambda u, x, t: 0.01 * js.laplacian(u)(x) + RATES[name](u, x, t)
+    problem = js.Problem(
+        lambda u, x, t: js.dt(u)(x) - made(u, x, t) - jax.grad(exact, 1)(x, t) + made(lambda y: exact(y, t), x, t),
+        {"left": js.neumann(0.0), "right": js.neumann(0.0)},
+    )
+    run = js.evolve(problem, cloud, lambda x: exact(x, 0.0), t=(0.0, 1.0), steps=80, scheme=scheme)
+    error = np.abs(run.u[-1] - np.asarray(jax.vmap(exact, (0, None))(cloud.points, 1.0))).max()
+    assert error > 1e-3 and 0.7 * error < float(run.error_estimate()[-1].max()) < 1.5 * error
+
+
+@pytest.mark.parametrize("scheme", ["imex", "esdirk"])
+def test_what_steps_leave_grows_as_well(scheme):
+    """u' = 10 u (1 - u), no error in space: what the first steps leave grows a thousandfold."""
+    rate = lambda u, x, t: js.dt(u)(x) - 0.01 * js.laplacian(u)(x) - 10 * u(x) * (1 - u(x))
+    problem = js.Problem(rate, {"left": js.neumann(0.0), "right": js.neumann(0.0)})
+    for n in (10, 40):
+        run = js.evolve(problem, js.interval(0.0, 1.0, 17), 1e-3, t=(0.0, 0.7), steps=n, scheme=scheme)
+        error = np.abs(run.u[-1] - 1 / (1 + 999 * np.exp(-7.0))).max()
+        assert 0.3 * error < float(run.error_estimate()[-1].max()) < 10 * error
+
+
 def test_what_is_over_soon():
     """A wave of five particles is gone after a hundredth of the time, and its error goes on with the slow one."""
     problem = js.Problem(lambda u, x, t: js.dt(u)(x) - js.laplacian(u)(x), ENDS)

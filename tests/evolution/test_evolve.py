@@ -120,15 +120,32 @@ def front(x, t):
     return 1.0 / (1.0 + jnp.exp((4.0 * x[0] - jnp.sqrt(2.0) * 0.2 * t) / jnp.sqrt(2.0)))
 
 
-@pytest.mark.parametrize(("scheme", "most"), [("imex", 1e-6), ("esdirk", 1e-7)])
-def test_a_travelling_front(scheme, most):
+@pytest.mark.parametrize(("scheme", "second"), [("imex", False), ("esdirk", False), ("imex", True)])
+def test_orders_of_reactions(scheme, second):
+    """No error in space: u' = 3 u (1 - u), and the angle of a pendulum, u'' = -sin u, that falls from the side."""
+    cloud = js.interval(0.0, 1.0, 9)
+    rate = (lambda u, x, t: js.dt(u, 2)(x) + jnp.sin(u(x))) if second else (
+        lambda u, x, t: js.dt(u)(x) - 3 * u(x) * (1 - u(x))
+    )  # fmt: skip
+    pde = lambda u, x, t: rate(u, x, t) - 0.01 * js.laplacian(u)(x)  # noqa: E731
+    problem = js.Problem(pde, everywhere(cloud, js.neumann(0.0)))
+    # The pendulum is at the bottom after a quarter of its period, K(1/sqrt 2).
+    start, end = ((np.pi / 2, 0.0), 1.8540746773013719) if second else (0.1, 1.0)
+    exact = 0.0 if second else 1.0 / (1.0 + 9.0 * np.exp(-3.0))
+    runs = [js.evolve(problem, cloud, start, t=(0.0, end), steps=n, scheme=scheme) for n in (8, 32)]
+    few, many = (np.abs(run.u[-1] - exact).max() for run in runs)
+    assert few < 3e-3 and np.log2(few / many) / 2 > 3.6
+
+
+@pytest.mark.parametrize("scheme", ["imex", "esdirk"])
+def test_a_travelling_front(scheme):
     cloud = js.interval(0.0, 1.0, 31)
     problem = js.Problem(
         lambda u, x, t: js.dt(u)(x) - js.laplacian(u)(x) / 16 - u(x) * (1 - u(x)) * (u(x) - 0.3),
         everywhere(cloud, js.dirichlet(front)),
     )
     run = js.evolve(problem, cloud, lambda x: front(x, 0.0), t=(0.0, 2.0), steps=40, order=6, scheme=scheme)
-    assert np.abs(run.u[-1] - at(front, cloud, 2.0)).max() < most and not run.flags
+    assert np.abs(run.u[-1] - at(front, cloud, 2.0)).max() < 1e-7 and not run.flags
 
 
 def test_burgers():
@@ -470,6 +487,24 @@ def test_jit_and_vmap():
     assert np.abs(jax.vmap(last)(some) - one).max() < 1e-12
     value, found = mm.quickly(jax.value_and_grad(last))(some[0])
     assert abs(value - one[0]) < 1e-12 and abs(found - jax.grad(last)(some[0])) < 1e-9 * abs(found)
+
+
+def test_a_reaction_inside_of_a_program():
+    def last(s):
+        p = {"k": 0.3, "s": s, "b": 0.5, "a": 0.4}
+        return jnp.sum(js.evolve(reacting(p), ROD, 0.5, t=(0.0, 0.5), steps=6, order=2, scheme="imex").u[-1])
+
+    alone, compiled = (jax.value_and_grad(f)(jnp.asarray(0.3)) for f in (last, jax.jit(last)))
+    assert abs(alone[0] - compiled[0]) < 1e-12 and abs(alone[1] - compiled[1]) < 1e-10
+
+
+def test_no_explicit_half_for_an_equation_without_a_rate():
+    problem = js.Problem(
+        lambda u, x, t: jnp.stack([js.dt(u)(x)[0] - js.laplacian(u)(x)[1], u(x)[1] - u(x)[0] ** 3]),
+        everywhere(ROD, js.dirichlet(0.0)), fields=2,
+    )  # fmt: skip
+    with pytest.raises(ValueError, match='imex.*without a rate.*"esdirk"'):
+        js.evolve(problem, ROD, jnp.zeros(2), t=(0.0, 0.1), steps=4, scheme="imex")
 
 
 # ------------------------------------------------------------------ refusals and failures

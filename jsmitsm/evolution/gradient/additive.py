@@ -10,6 +10,9 @@ backwards through the stages i = s .. 1, Y_s being the next state:
 
 and at the start of the step y* += -A^T P_0* + Q'(y)^T Q_0*, F_0* += P_0*, A* -= P_0* y^T. Where stages are solved by
 Newton's method Q_i counts to P_i: then S = E + g h (A + B N'(Y_i)), and N takes the cotangent g h l + P_i* of Q_i.
+Elsewhere the end E Y = E Y_s + h sum_j c_j Q_j comes first:
+
+    l = E^-T Y*,   Y_s* += Y*,   Q_j* += h c_j l,   h* += l . sum_j c_j Q_j,   E* += l (Y_s - Y)^T
 """
 
 from __future__ import annotations
@@ -35,6 +38,15 @@ def back(
     at, system, pull, ys = bars.at, bars.system, bars.pull, [y, *stages]
     h, g, s = float(at.h), scheme.gamma, scheme.stages - 1
     first = k * s
+    closes = pull is not None and newton is None
+    q_bar = np.zeros((s + 1, system.size))
+    if pull is not None and newton is None:
+        *ys, end = ys
+        last = system.settled(h).solve_transposed(y_bar)
+        q_bar = np.multiply.outer(h * scheme.closing, last)
+        bars.mass(last[None], (ys[-1] - end)[None])
+        pull.collect(q_bar[s], ys[s], first + s)
+        y_bar = y_bar + pull.state(q_bar[s], ys[s], first + s)
     low, p_bar = np.empty((s, system.size)), np.zeros((s + 1, system.size))
     stage_bar = y_bar
     for i in range(s, 0, -1):
@@ -49,13 +61,16 @@ def back(
         p_bar[i - 1, bars.still] = 0.0
         stage_bar = -system.stiff_transposed(p_bar[i - 1])
         if pull is not None:
-            asked = p_bar[i - 1] if newton is not None else (h * scheme.explicit[i:, i - 1]) @ low[i - 1 :]
+            asked = p_bar[i - 1]
+            if closes:
+                asked = (h * scheme.explicit[i:, i - 1]) @ low[i - 1 :] + q_bar[i - 1]
             stage_bar += pull.state(asked, ys[i - 1], first + i - 1)
             if newton is None or i == 1:
                 pull.collect(asked, ys[i - 1], first + i - 1)
     if bars.timed:
-        rates = _rates(scheme, bars, newton is not None, ys, first)
-        bars.h += sum(float(v @ rate) for v, rate in zip(low, rates[1:]))
+        rates, pushes = _rates(scheme, bars, newton is not None, ys, first)
+        bars.h += sum(float(v @ rate) for v, rate in zip(low, rates))
+        bars.h += sum(float(last @ q) * c for c, q in zip(scheme.closing, pushes)) if closes else 0.0
     total, states = low.sum(axis=0), np.array(ys)
     bars.jump[first] += total
     bars.jump[first + 1 : first + s + 1] -= low
@@ -66,8 +81,8 @@ def back(
     return system.mass_transposed(total) + stage_bar
 
 
-def _rates(scheme: Additive, bars: Bars, newton: bool, ys: list[np.ndarray], first: int) -> list[Any]:
-    """For every stage what its right-hand side and matrix take of h."""
+def _rates(scheme: Additive, bars: Bars, newton: bool, ys: list[np.ndarray], first: int) -> tuple[Any, Any]:
+    """For every implicit stage what its right-hand side and matrix take of h, and all that is added explicitly."""
     at, s = bars.at, scheme.stages - 1
     p = [at.force[first + j] - bars.system.stiff(y) for j, y in enumerate(ys)]
     q = [np.zeros_like(v) for v in p]
@@ -77,18 +92,18 @@ def _rates(scheme: Additive, bars: Bars, newton: bool, ys: list[np.ndarray], fir
             p, q = [a + b for a, b in zip(p, q)], [np.zeros_like(v) for v in q]
     slopes = np.array(p)
     slopes[:, bars.still] = 0.0
-    out: list[Any] = [None]
+    out = []
     for i in range(1, s + 1):
         before = sum(scheme.implicit[i, j] * slopes[j] + scheme.explicit[i, j] * q[j] for j in range(i))
         out.append(before + scheme.gamma * p[i])
-    return out
+    return out, q
 
 
 def scanned(scheme: Additive, semi: Semidiscrete, steps: int, given: Inputs) -> Any:
     """The same as ``Stepper`` inside of a program: a scan over the steps, every solve JAX's to differentiate."""
     now = semi.stated(given.values, given.push)
     system, still, s, g = now.system, semi.system.undriven(), scheme.stages - 1, scheme.gamma
-    resolvent = system.resolvent(given.h * g)
+    resolvent, settled = system.resolvent(given.h * g), system.settled(given.h)
 
     def step(y: Any, window: Any) -> tuple[Any, Any]:
         whole = given.force, given.jump, given.known, given.times
@@ -101,6 +116,8 @@ def scanned(scheme: Additive, semi: Semidiscrete, steps: int, given: Inputs) -> 
             r = r + sum(given.h * scheme.implicit[i, j] * ps[j] for j in range(i) if scheme.implicit[i, j])
             r = r + sum(given.h * scheme.explicit[i, j] * qs[j] for j in range(i) if scheme.explicit[i, j])
             last = resolvent.solve(r)
+        qs.append(now.explicit(last, times[s], known[s]))
+        last = last + settled.solve(given.h * sum(c * q for c, q in zip(scheme.closing, qs)))
         return last, last
 
     y = jnp.asarray(given.y, float)

@@ -131,8 +131,8 @@ def _check_viscosity(
 
 def with_pressure_equation(stated: Problem, whole: Traced, flow: Flow, cloud: Cloud) -> tuple[Problem, Flow]:
     """The problem with an equation for the pressure, and conditions for it."""
-    fixed, floats = _of_pressure(closed(stated, whole), whole, flow)
-    dim = cloud.dim
+    recorded, dim = closed(stated, whole), cloud.dim
+    fixed, floats = _of_pressure(recorded, whole, flow)
 
     def continuity(u: Any, x: Any, n: Any, p: Any) -> Any:
         return total(partial(u[k], unit(dim, i))(x) for i, k in enumerate(flow.velocity))
@@ -148,10 +148,14 @@ def with_pressure_equation(stated: Problem, whole: Traced, flow: Flow, cloud: Cl
 
     bcs, loose = dict(stated.bcs), []
     for name, conditions in stated.bcs.items():
-        if name in cloud.groups and name not in fixed and conditions[0].kind not in ("periodic", "fix", "free"):
-            held = {k for c in conditions if c.kind == "dirichlet" for k in _fields(c, stated.fields)}
-            slips = _slips(conditions, flow, cloud, name)
+        if name not in cloud.groups or conditions[0].kind in ("periodic", "fix", "free"):
+            continue
+        # With div u = 0 the system takes one condition for each velocity, without it one more.
+        slips = name not in fixed and _slips(conditions, flow, cloud, name)
+        if sum(_rows(c, stated.fields) for c in recorded.bcs[name]) <= dim:
             bcs[name] = [*conditions, condition(across if slips else continuity)]
+        if name not in fixed:
+            held = {k for c in conditions if c.kind == "dirichlet" for k in _fields(c, stated.fields)}
             loose += [] if slips or held >= set(flow.velocity) else [name]
     if floats:
         inner = np.asarray(cloud.groups["interior"])
@@ -167,6 +171,11 @@ def with_pressure_equation(stated: Problem, whole: Traced, flow: Flow, cloud: Cl
 
 def _fields(c: Condition, fields: int) -> tuple[int, ...]:
     return tuple(range(fields)) if c.field is None else (c.field,)
+
+
+def _rows(c: Condition, fields: int) -> int:
+    """How many numbers a recorded condition gives at a particle."""
+    return c.residual.n_equations if c.kind == "condition" else len(_fields(c, fields))
 
 
 def _slips(conditions: Sequence[Condition], flow: Flow, cloud: Cloud, name: str) -> bool:

@@ -10,6 +10,8 @@ from jsmitsm.evolution.steps.stepping import Step
 
 # Steps of a run with equal ones whose error is estimated, besides the first ones.
 LOOKS = 8
+# Errors are kept for so many parts of a run.
+PARTS = 40
 
 
 def looks(steps: int) -> dict[int, float]:
@@ -21,11 +23,17 @@ def looks(steps: int) -> dict[int, float]:
 
 
 class InTime:
-    """Adds up errors of steps; what damps the solution damps them, by one step of backward Euler for each look."""
+    """Adds up errors of steps; what damps the solution damps them, by one step of backward Euler for each look.
 
-    def __init__(self) -> None:
+    parts: those of each of PARTS parts of a run by themselves, when they were last added to and their sum, for those
+    who know what makes them grow.
+    """
+
+    def __init__(self, t0: float, t1: float) -> None:
         self.times: list[float] = []
         self.sizes: list[float] = []
+        self.parts: dict[int, tuple[float, np.ndarray]] = {}
+        self._whole = t0, t1
         self._sum: Any = None
 
     def add(self, stepper: Any, step: Step, t: float, h: float, weight: float = 1.0) -> None:
@@ -33,6 +41,9 @@ class InTime:
         if step.error is None:
             return
         system = stepper.system
+        t0, t1 = self._whole
+        part = int(PARTS * (t - t0) / (t1 - t0) - 1e-9)
+        self.parts[part] = t, self.parts.get(part, (t, 0.0))[1] + weight * step.error
         before = self._sum
         if before is not None and not system.second and getattr(stepper, "newton", None) is None:
             before = system.resolvent(stepper.smallest(h)).solve(system.mass(before))

@@ -13,8 +13,8 @@ from jsmitsm.runtime.errors import SolveError
 
 # Corrections at the most; a correction must shrink to this part of the last, or the matrix is made anew.
 MOST, SLOW = 12, 0.1
-# Relative change of the state at which a stage counts as solved.
-SOLVED = 1e-11
+# Relative change of the state at which a stage counts as solved, and of an error that is estimated.
+SOLVED, ESTIMATED = 1e-11, 1e-3
 
 
 class Newton:
@@ -35,7 +35,7 @@ class Newton:
             if not np.isfinite(largest(misfit)):
                 break
             if self._factor is None or g != self._g:
-                self._prepare(y, t, g, known)
+                self._prepare(semi.placed(y, known), t, g)
                 fresh = True
             change = self._factor.solve(misfit)
             y = y - change
@@ -62,7 +62,7 @@ class Newton:
         system, x, r, before = self.semi.system, np.zeros_like(b), b, np.inf
         fresh = self._factor is None or g != self._g
         if fresh:
-            self._prepare(y, t, g, known)
+            self._prepare(self.semi.placed(y, known), t, g)
         for _ in range(2 * MOST):
             change = self._factor.solve(r, True)
             x = x + change
@@ -70,16 +70,36 @@ class Newton:
             if size <= 1e-2 * SOLVED or (size <= SOLVED and size >= 0.5 * before):
                 return x
             if size > SLOW * before and not fresh:
-                self._prepare(y, t, g, known)
+                self._prepare(self.semi.placed(y, known), t, g)
                 fresh = True
             before = size
             r = b - system.mass_transposed(x) - g * (system.stiff_transposed(x) - pull.state(x, y, number))
         raise Stopped(f"the transposed equations of a stage at t = {t:.6g} were not solved; take more steps")
 
-    def _prepare(self, y: np.ndarray, t: float, g: float, known: np.ndarray) -> None:
+    def around(self, r: np.ndarray, u: np.ndarray, t: float, g: float) -> np.ndarray:
+        """Solves E y + g (A y + B N'(u) y) = r (n, m) for errors y of values u (N, F), as well as these are known."""
+        system, size = self.semi.system, lambda x: np.abs(x).max(axis=0, initial=0.0)
+        slope = self.semi.linearised(self.semi.steepness(u, t))
+        fresh = self._factor is None or g != self._g
+        if fresh:
+            self._prepare(u, t, g)
+        x, before = self._factor.solve(r), np.inf
+        while not fresh:
+            change = self._factor.solve(r - system.mass(x) - g * (system.stiff(x) + slope @ x))
+            x = x + change
+            now = float((size(change) / np.maximum(size(x), 1e-300)).max())
+            if now <= ESTIMATED:
+                break
+            if not now <= 0.5 * before:
+                self._prepare(u, t, g)
+                return self._factor.solve(r)
+            before = now
+        return x
+
+    def _prepare(self, u: np.ndarray, t: float, g: float) -> None:
         semi = self.semi
         system = semi.system
-        extra = (g * semi.linearised(semi.steepness(semi.placed(y, known), t))).tocoo()
+        extra = (g * semi.linearised(semi.steepness(u, t))).tocoo()
         more = Sparse(extra.data, extra.coords[0], extra.coords[1], extra.shape)
         try:
             parts = [(1.0, system.masses[0]), (g, system.stiffness), (1.0, more)]

@@ -4,8 +4,9 @@ All stages are written in values, not in rates: with P_j = F(t_j) - A Y_j and Q_
 
     (E + g h A) Y_i = E y + H(t) - H(t_i) + h sum_{j<i} (a_ij P_j + e_ij Q_j) + g h F(t_i)
 
-where H is what the held particles' values contribute to E: their rates are never needed, and what jumps at the start
-enters as the impulse that it is. No solve with E either, so that equations without a rate are welcome.
+and where N is explicit the end of a step is that of its weights b, no stage: E Y = E Y_s + h sum_j (b_j - e_sj) Q_j.
+H is what the held particles' values contribute to E: their rates are never needed, and what jumps at the start
+enters as the impulse that it is. Equations without a rate are welcome where all is implicit: there is no solve with E.
 """
 
 from __future__ import annotations
@@ -48,6 +49,7 @@ class Step:
     known: np.ndarray  # the held values
     slope: np.ndarray  # P at the end
     pushed: Any  # Q at the end
+    # the implicit ones, and the end where it is none of them
     stages: list[np.ndarray] = field(default_factory=list)
     error: np.ndarray | None = None
 
@@ -59,7 +61,7 @@ class Stepper:
                  newton: Any = None):  # fmt: skip
         self.system, self.drive, self.scheme = system, drive, scheme
         self.explicit, self.newton = explicit, newton
-        self.still = system.undriven()
+        self.still, self.closes = system.undriven(), explicit is not None and newton is None
 
     @property
     def order(self) -> int:
@@ -87,7 +89,7 @@ class Stepper:
         force, held, known = self.drive.step(t, h)
         base = system.mass(last.y) + last.held
         slopes, pushes, stages = [last.slope], [last.pushed], []
-        now = last
+        now, y = last, last.y
         for i in range(1, s.stages):
             r = base - held[i - 1] + (h * s.gamma) * force[i - 1]
             for j in range(i):
@@ -104,6 +106,10 @@ class Stepper:
             stages.append(y)
             slopes.append(now.slope)
             pushes.append(now.pushed)
+        if self.closes:
+            y = y + system.settled(h).solve(h * sum(w * q for w, q in zip(s.closing, pushes)))
+            now = self._ended(y, t + h, force[-1], held[-1], known[-1])
+            stages.append(y)
         now.stages = stages
         if estimate and s.embedded is not None:
             gap = s.weights - s.embedded

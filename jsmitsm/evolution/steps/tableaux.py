@@ -34,9 +34,10 @@ def _sampling(matrix: np.ndarray, at: np.ndarray, nodes: np.ndarray, consistent:
 
 @dataclass(frozen=True, eq=False)
 class Additive:
-    """A stiffly accurate scheme with an explicit first stage, one implicit coefficient, and an explicit companion.
+    """A scheme with an explicit first stage, one implicit coefficient, and an explicit companion.
 
-    implicit, explicit (s, s); nodes (s,); weights (s,), of both halves; embedded (s,) or None, of one order less.
+    The last stage is the end of a step for the implicit half alone: the companion is not stiffly accurate. implicit,
+    explicit (s, s); nodes (s,); weights (s,), of both halves; embedded (s,) or None, of one order less.
     """
 
     name: str
@@ -58,6 +59,11 @@ class Additive:
     @property
     def stages(self) -> int:
         return len(self.nodes)
+
+    @property
+    def closing(self) -> np.ndarray:
+        """What the end of a step takes of the explicit half (s,) beyond the last stage."""
+        return self.weights - self.explicit[-1]
 
 
 def _kencarp4() -> Additive:

@@ -1,0 +1,1 @@
+"""Ways from facets to the boundary, and where its edges lie over them."""
