@@ -25,6 +25,10 @@ _STEPS = 8
 _FLAT = 1e-9
 # The boundary is at most so many widths of a facet away, and its normal at such an angle (its cosine) to the way there.
 _FAR, _STEEP = 0.5, 0.1
+# No polynomial is followed farther than so many sizes of its surroundings.
+_ASTRAY = 10.0
+# A way that meets the boundary at a smaller angle (its cosine) would count for too much.
+_GRAZING = 0.02
 
 
 def domain_rule(cloud: Cloud, degree: int) -> tuple[np.ndarray, np.ndarray]:
@@ -35,56 +39,86 @@ def domain_rule(cloud: Cloud, degree: int) -> tuple[np.ndarray, np.ndarray]:
     sides = corners[:, 1:] - corners[:, :1]
     volume = np.abs(np.linalg.det(sides))
     inner = np.einsum("qk,mkd->mqd", at, corners), volume[:, None] * weights
-    parts = [inner] if cloud.dim == 1 else [inner, _layers(cloud, degree)]
-    return tuple(np.concatenate([part[k].reshape(-1, *part[k].shape[2:]) for part in parts]) for k in (0, 1))  # type: ignore
+    inner = inner[0].reshape(-1, cloud.dim), inner[1].ravel()
+    return inner if cloud.dim == 1 else tuple(map(np.concatenate, zip(inner, _layers(cloud, degree))))  # type: ignore
 
 
 def surface_rule(
-    cloud: Cloud, facets: np.ndarray, normal: np.ndarray, degree: int
+    cloud: Cloud, named: np.ndarray, members: Members, degree: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points (M, Q, D), weights (M, Q) and unit normals (M, Q, D) on the boundary over facets (M, D)."""
-    swept = _swept(cloud, facets, normal, degree)
-    found, volume = swept.at(1.0)
-    # A layer that ends at the surface is as thick as the way's part along the normal.
-    return found, volume / np.einsum("mqd,mqd->mq", swept.way, swept.outward), swept.outward
+    """Points (Q, D), weights (Q,) and unit normals (Q, D) on the part of the boundary with the particles named (N,)."""
+    facets, normal = boundary_facets(cloud)
+    ways, near = _ways(cloud, facets, normal)
+    most = named[facets].sum(axis=1) * 2 > facets.shape[1]
+    own = members(np.asarray(cloud.points, float)[facets].mean(axis=1), normal, most)
+    # Facets of another part may reach across an edge to this one.
+    some = np.flatnonzero(own | near)
+    found = []
+    for swept, which in _swept(cloud, facets[some], normal[some], ways[some], near[some], degree):
+        at, volume = swept.at(1.0)
+        # A layer that ends at the surface is as thick as the way's part along the normal.
+        weights = volume / np.maximum(np.einsum("mqd,mqd->mq", swept.way, swept.outward), _GRAZING)
+        apart = at.shape[1] == 1  # their points may lie on different sides of an edge
+        mine = members(at[:, 0], swept.outward[:, 0], most[some[which]]) if apart else own[some[which]]
+        found.append([x[mine].reshape(-1, *x.shape[2:]) for x in (at, weights, swept.outward)])
+    return tuple(np.concatenate(part) for part in zip(*found))  # type: ignore
 
 
 def _layers(cloud: Cloud, degree: int) -> tuple[np.ndarray, np.ndarray]:
-    """Points (M, Q, D) and signed weights (M, Q) between the facets and the boundary."""
+    """Points (Q, D) and signed weights (Q,) between the facets and the boundary."""
     facets, normal = boundary_facets(cloud)
-    facets, normal = (x[~lying_on(cloud, facets)] for x in (facets, normal))
-    if not len(facets):
-        return np.zeros((0, 1, cloud.dim)), np.zeros((0, 1))
-    swept = _swept(cloud, facets, normal, degree)
+    ways, near = _ways(cloud, facets, normal)
+    some = np.flatnonzero(near | ~lying_on(cloud, facets))
+    found, measure = [np.zeros((0, cloud.dim))], [np.zeros(0)]
     x, w = np.polynomial.legendre.leggauss(degree // 2 + 1)
-    found, measure = [], []
-    for share, part in zip((x + 1.0) / 2.0, w / 2.0):
-        here, volume = swept.at(share)
-        found.append(here)
-        measure.append(part * swept.reach * volume)
-    return np.concatenate(found, axis=1), np.concatenate(measure, axis=1)
+    for swept, _ in _swept(cloud, facets[some], normal[some], ways[some], near[some], degree):
+        for share, part in zip((x + 1.0) / 2.0, w / 2.0):
+            here, volume = swept.at(share)
+            found.append(here.reshape(-1, cloud.dim))
+            measure.append((part * swept.reach * volume).ravel())
+    return np.concatenate(found), np.concatenate(measure)
 
 
-def _swept(cloud: Cloud, facets: np.ndarray, normal: np.ndarray, degree: int) -> _Swept:
-    """The ways from facets (M, D) with outward normals (M, D) to the boundary."""
+def _ways(cloud: Cloud, facets: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The ways (M, D, D) from the corners of all facets (M, D), and which (M,) come near an edge that the shape tells."""
+    own = normals_of(cloud)
+    if cloud._shape is not None and cloud.dim == 3:
+        return open_ways(np.asarray(cloud.points, float), facets, normal, own)
+    flat = np.broadcast_to(normal[:, None], (*facets.shape, cloud.dim))
+    alike = np.sum(own[facets] * flat, axis=2) >= SMOOTH
+    return np.where(alike[..., None], own[facets], flat), np.zeros(len(facets), bool)
+
+
+def _swept(
+    cloud: Cloud, facets: np.ndarray, normal: np.ndarray, ways: np.ndarray, near: np.ndarray, degree: int
+) -> list[tuple[Swept, np.ndarray]]:
+    """The ways from facets (M, D) with outward normals (M, D) to the boundary, and which facets they are from.
+
+    Facets near an edge over which it is not smooth come last, a point a row.
+    """
     corners = np.asarray(cloud.points, float)[facets]
-    flat = np.broadcast_to(normal[:, None], corners.shape)
-    own = normals_of(cloud)[facets]
-    ways = np.where((np.sum(own * flat, axis=2) >= SMOOTH)[..., None], own, flat)
     # An even number: the middle of a side is as near to one particle as to the other, whose polynomials differ there.
     at, weights = simplex_rule(cloud.dim - 1, 2 * (degree // 4 + 1))
     base, way = (np.einsum("qk,mkd->mqd", at, x) for x in (corners, ways))
     # Where the shape is known the graph is the start of the way there only.
     graph = _graphs(cloud, corners, facets, normal, degree if cloud._shape is None else min(degree, 4))
-    reach, outward = _to_shape(cloud, base, way, normal, *graph(base, way))
+    reach, outward, good = _to_shape(cloud, base, way, normal, *graph(base, way))
     # No boundary is so far from a facet: polynomials of particles across a gap, or around a sharp corner, go astray.
     width = np.linalg.norm(np.ptp(corners, axis=1), axis=1)[:, None]
     sane = (np.abs(reach) <= _FAR * width) & (np.einsum("mqd,mqd->mq", way, outward) >= _STEEP)
-    sane = sane.all(axis=1, keepdims=True)
-    reach, outward = np.where(sane, reach, 0.0), np.where(sane[..., None], outward, normal[:, None])
-    sides = corners[:, 1:] - corners[:, :1]
+    sane = sane.all(axis=1)
+    reach, outward = np.where(sane[:, None], reach, 0.0), np.where(sane[:, None, None], outward, normal[:, None])
+    sides, turns = (x[:, 1:] - x[:, :1] for x in (corners, ways))
     handed = np.sign(np.linalg.det(np.concatenate([sides, normal[:, None]], axis=1)))
-    return _Swept(base, way, reach, weights, sides, ways[:, 1:] - ways[:, :1], handed[:, None], outward)
+    swept = Swept(base, way, reach, weights, sides, turns, handed[:, None], outward)
+    if cloud._shape is None or cloud.dim < 3:
+        return [(swept, np.arange(len(facets)))]
+    own = np.einsum("mkd,md->mk", normals_of(cloud)[facets], normal) >= SMOOTH
+    smooth = own.all(axis=1) & sane & good & (np.einsum("mqd,mrd->mqr", outward, outward) >= SMOOTH).all(axis=(1, 2))
+    rest = np.flatnonzero(~smooth)
+    kept = Swept(*(x if x is weights else x[smooth] for x in swept))
+    parted, of = over_edges(cloud._shape, corners[rest], ways[rest], normal[rest], degree)
+    return [(kept, np.flatnonzero(smooth)), (parted, rest[of])]
 
 
 def _graphs(cloud: Cloud, corners: np.ndarray, facets: np.ndarray, normal: np.ndarray, degree: int):
@@ -120,6 +154,7 @@ def _graphs(cloud: Cloud, corners: np.ndarray, facets: np.ndarray, normal: np.nd
             xi, rise = np.einsum("mqd,mtd->mqt", at, tangents), np.einsum("mqd,md->mq", at, normal)
             miss = rise - np.einsum("mqa,ma->mq", np.prod(xi[:, :, None] ** some, axis=3), fitted)
             t = t - miss * size[:, None] / np.einsum("mqd,md->mq", way, normal)
+            t = np.clip(t, -_ASTRAY * size[:, None], _ASTRAY * size[:, None])
         unit = np.eye(dim - 1, dtype=int)
         powers = [b * np.prod(xi[:, :, None] ** np.maximum(some - e, 0), axis=3) for e, b in zip(unit, some.T)]
         slope = np.einsum("tmqa,ma->mqt", powers, fitted)
@@ -131,10 +166,11 @@ def _graphs(cloud: Cloud, corners: np.ndarray, facets: np.ndarray, normal: np.nd
 
 def _to_shape(
     cloud: Cloud, base: np.ndarray, way: np.ndarray, normal: np.ndarray, reach: np.ndarray, outward: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """How far it is to the boundary, and its normals, by the shape where the cloud knows it: the graph came close."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """How far it is to the boundary, its normals, and for which facets (M,) this is what the shape says, where the cloud
+    knows it: the graph came close."""
     if cloud._shape is None:
-        return reach, outward
+        return reach, outward, np.ones(len(base), bool)
 
     def off(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         distance, direction = cloud._shape.distance((base + t[..., None] * way).reshape(-1, cloud.dim))
@@ -153,4 +189,5 @@ def _to_shape(
     width = np.linalg.norm(np.ptp(base, axis=1), axis=1)[:, None]
     good = ((np.abs(miss) < near) & (steep > 0.1) & (np.abs(t - reach) < 0.3 * width)).all(axis=1, keepdims=True)
     t, outward = np.where(good, t, reach), np.where(good[..., None], own, outward)
-    return np.where(straight, 0.0, t), np.where(straight[..., None], normal[:, None], outward)
+    t, outward = np.where(straight, 0.0, t), np.where(straight[..., None], normal[:, None], outward)
+    return t, outward, (good | straight)[:, 0]

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jsmitsm.cloud.cloud import Cloud
-from jsmitsm.cloud.domain_quadrature import SMOOTH, domain_rule, surface_rule
+from jsmitsm.cloud.domain_quadrature import SMOOTH, Members, domain_rule, surface_rule
 from jsmitsm.cloud.regions.region_cloud import RegionCloud, sides
 from jsmitsm.cloud.triangulation import boundary_facets
 from jsmitsm.runtime.errors import explaining, is_whole
@@ -86,13 +86,13 @@ def quadrature(cloud: Cloud, group: str | None = None, degree: int = 8) -> Quadr
     if group not in cloud.groups or group == "interior":
         known = ", ".join(repr(name) for name in cloud.groups if name != "interior")
         raise ValueError(f"group: expected a boundary group ({known}), got {group!r}")
-    points = np.asarray(cloud.points, float)
-    facets, normal = boundary_facets(cloud)
-    facets, normal = (x[_members(cloud, facets, normal, group)] for x in (facets, normal))
+    named = np.zeros(len(cloud), bool)
+    named[np.asarray(cloud.groups[group])] = True
     if cloud.dim == 1:
-        return Quadrature(points[facets[:, 0]], np.ones(len(facets)), normal)
-    found = surface_rule(cloud, facets, normal, int(degree))
-    return Quadrature(*(x.reshape(-1, *x.shape[2:]) for x in found))
+        ends, normal = boundary_facets(cloud)
+        here = ends[named[ends[:, 0]], 0]
+        return Quadrature(np.asarray(cloud.points, float)[here], np.ones(len(here)), normal[named[ends[:, 0]]])
+    return Quadrature(*surface_rule(cloud, named, _members(cloud, named), int(degree)))
 
 
 def _of_regions(cloud: RegionCloud, group: str | None, degree: int) -> Quadrature:
@@ -106,22 +106,24 @@ def _of_regions(cloud: RegionCloud, group: str | None, degree: int) -> Quadratur
     return Quadrature(*(np.concatenate(arrays) for arrays in zip(*made)))
 
 
-def _members(cloud: Cloud, facets: np.ndarray, normal: np.ndarray, group: str) -> np.ndarray:
-    """Mask of a group's facets: the nearest particle whose normal is like the facet's belongs to it.
+def _members(cloud: Cloud, named: np.ndarray) -> Members:
+    """Tells which points of the boundary, with their normals, belong to the group of the particles named (N,): those
+    whose nearest particle with a normal like theirs does.
 
     At edges and corners of the domain all corners of a facet may be of other groups. Without
     normals, or with none alike, most of its corners decide.
     """
-    named = np.zeros(len(cloud), bool)
-    named[np.asarray(cloud.groups[group])] = True
-    mask = named[facets].sum(axis=1) * 2 > facets.shape[1]
     if cloud.normals is None:
-        return mask
+        return lambda at, normal, most: most
     from scipy.spatial import cKDTree
 
-    points, own, rim = np.asarray(cloud.points), np.asarray(cloud.normals), cloud.boundary
-    count = min(_AROUND, len(rim))
-    near = rim[cKDTree(points[rim]).query(points[facets].mean(axis=1), k=range(1, count + 1))[1]]
-    alike = np.nan_to_num(np.sum(own[near] * normal[:, None], axis=2), nan=-1.0) >= SMOOTH
-    first = np.take_along_axis(near, alike.argmax(axis=1)[:, None], axis=1)[:, 0]
-    return np.where(alike.any(axis=1), named[first], mask)
+    own, rim = np.asarray(cloud.normals), cloud.boundary
+    tree, count = cKDTree(np.asarray(cloud.points)[rim]), min(_AROUND, len(rim))
+
+    def members(at: np.ndarray, normal: np.ndarray, most: np.ndarray) -> np.ndarray:
+        near = rim[tree.query(at, k=range(1, count + 1))[1]]
+        alike = np.nan_to_num(np.sum(own[near] * normal[:, None], axis=2), nan=-1.0) >= SMOOTH
+        first = np.take_along_axis(near, alike.argmax(axis=1)[:, None], axis=1)[:, 0]
+        return np.where(alike.any(axis=1), named[first], most)
+
+    return members

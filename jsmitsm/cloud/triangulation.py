@@ -52,20 +52,34 @@ def boundary_facets(cloud: Cloud) -> tuple[np.ndarray, np.ndarray]:
         left, right = np.setdiff1d(*cells.T), np.setdiff1d(*cells.T[::-1])
         return np.concatenate([left, right])[:, None], np.repeat([-1.0, 1.0], [len(left), len(right)])[:, None]
     delaunay = _delaunay(points)
-    cells = delaunay.simplices
+    cells, beside = delaunay.simplices, delaunay.neighbors
+    facets = np.stack([np.delete(cells, k, axis=1) for k in range(cells.shape[1])], axis=1)
+    normal = _across(points[facets])
+    size = np.linalg.norm(normal, axis=2)
     inside = ~_outside(cloud, points, cells)
-    # Flat simplices count here: without them their neighbours' facets would face nothing.
-    facets = np.concatenate([np.delete(cells[inside], k, axis=1) for k in range(cells.shape[1])])
-    _, first, count = np.unique(np.sort(facets, axis=1), axis=0, return_index=True, return_counts=True)
-    facets = facets[first[count == 1]]
-    at = points[facets]
-    sides = at[:, 1:] - at[:, :1]
-    normal = np.stack([sides[:, 0, 1], -sides[:, 0, 0]], 1) if cloud.dim == 2 else np.cross(sides[:, 0], sides[:, 1])
-    length = np.linalg.norm(normal, axis=1, keepdims=True)
-    normal = normal / length
-    ahead = at.mean(axis=1) + 1e-3 * np.linalg.norm(sides[:, 0], axis=1, keepdims=True) * normal
-    into = delaunay.find_simplex(ahead)
-    return facets, np.where(((into >= 0) & inside[into])[:, None], -normal, normal)
+    flat, outer = ~_solid(points, cells), np.zeros(size.shape, bool)
+    while True:
+        outer = inside[:, None] & ((beside < 0) | ~inside[beside])
+        # Flat simplices within the domain count, or their neighbours' facets would face nothing. Those on its boundary
+        # do not: over a notch they would be a skin with nothing behind it.
+        skin = inside & flat & (np.where(outer, size, 0.0).sum(axis=1) > 0.49 * size.sum(axis=1))
+        if not skin.any():
+            break
+        inside &= ~skin
+    # Particles on one line make facets without area, which face nowhere.
+    outer &= size > 1e-9 * np.ptp(points[facets], axis=2).max(axis=2) ** (cloud.dim - 1)
+    normal = normal[outer] / size[outer][:, None]
+    own, opposite = np.nonzero(outer)
+    inward = points[cells[own, opposite]] - points[facets[outer][:, 0]]
+    return facets[outer], -np.copysign(1.0, np.einsum("md,md->m", inward, normal))[:, None] * normal
+
+
+def _across(at: np.ndarray) -> np.ndarray:
+    """Vectors (..., D) across facets (..., D, D), as long as these are large."""
+    sides = at[..., 1:, :] - at[..., :1, :]
+    if at.shape[-1] == 2:
+        return np.stack([sides[..., 0, 1], -sides[..., 0, 0]], axis=-1)
+    return np.cross(sides[..., 0, :], sides[..., 1, :])
 
 
 def lying_on(cloud: Cloud, facets: np.ndarray) -> np.ndarray:

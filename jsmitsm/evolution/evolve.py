@@ -65,10 +65,11 @@ def evolve(
     """Evolve ``problem`` on ``cloud`` from ``u0`` over the times ``t``.
 
     The functions of the problem take the time: ``pde(u, x, t)``, in which ``js.dt(u)(x)`` and ``js.dt(u, 2)(x)`` are
-    the rates of u; values of conditions ``(x, t)``; residuals of conditions ``(u, x, t)`` or ``(u, x, n, t)``; each
-    with ``params`` last where the problem has them. Rates enter linearly, with factors that may depend on x. An
-    equation without a rate holds at every moment. Where it is div v = 0, of the velocities v of an incompressible flow,
-    the pressure gets the divergence of the momentum equations for its own, and mean zero.
+    the rates of u; values of conditions ``(x, t)``; residuals of conditions ``(u, x, n, t)``, or as ``js.solve`` takes
+    them ``(u, x, n)``, whatever the normal is called, or ``(u, x, t)``, the third called t or time; each with
+    ``params`` last where the problem has them. Rates enter linearly, with factors that may depend on x. An equation
+    without a rate holds at every moment. Where it is div v = 0, of the velocities v of an incompressible flow, the
+    pressure gets the divergence of the momentum equations for its own, and mean zero.
 
     Parameters
     ----------

@@ -317,6 +317,9 @@ def in_words(error: Exception) -> str:
         return f"{text}{did_you_mean(error.name, dir(error.obj))}"
     if isinstance(error, TypeError) and re.match(r"(grad|laplacian|divergence|hessian|partial|dt)\(\) takes", text):
         return f"{text}; an operator makes a function of the point: js.laplacian(u)(x)"
+    if isinstance(error, TypeError) and "'function' object is not subscriptable" in text:
+        return (f"{text}; a plain function has no components u[k]: write js.laplacian(u)(x)[k] for "
+                "js.laplacian(u[k])(x), which serves fields and functions alike")  # fmt: skip
     return text
 
 

@@ -96,8 +96,8 @@ def correction(fit: Fit, values: Any, made: Run | None = None) -> Correction:
         e = A_{p+2}^-1 (b_{p+2} - A_{p+2} u_p),
 
     is what leads to the solution of order p + 2, or of a lower one where that knows nothing more (see ``compared``).
-    Where that matrix is singular, and for those who ask what each particle contributes, the defect is taken through
-    the solution's own: A_p^-1 D (b_{p+2} - A_{p+2} u_p). D brings the rows of the two orders to one scale, that of the
+    Where that matrix is singular a lower order is compared with, which is off by as much as p, or more. For those who
+    ask what each particle contributes, and where no order is lower, the defect is taken through the solution's own: A_p^-1 D (b_{p+2} - A_{p+2} u_p). D brings the rows of the two orders to one scale, that of the
     source in them, and rows of one-sided stencils count less: they amplify what order p + 2 misses itself.
     Solutions of other methods, whose rows are no such predictions, and of the least-squares form, whose rows have no
     common scale, are compared with that of method S of order p + 2 (in that form see ``_by_misfits``). Held values
@@ -150,9 +150,14 @@ def correction(fit: Fit, values: Any, made: Run | None = None) -> Correction:
 
     try:
         x, _ = above.solved(*entries, residual, balanced=False)
-    except SolveError:
-        x, _ = run.solved(*matrix(low, *own()), defect().reshape(-1)[free], balanced=False)
-    error = towards = spread(x)
+        error = towards = spread(x)
+    except SolveError:  # as on few particles
+        below = lower(fit.recipe.order, max(low.rec.orders))
+        if below < fit.recipe.order:
+            error = towards = _towards(fit, low, values, below)[0]
+        else:
+            x, _ = run.solved(*matrix(low, *own()), defect().reshape(-1)[free], balanced=False)
+            error = towards = spread(x)
     if order > fit.recipe.order >= HIGH and not is_traced(error, trust) and trust.min(initial=1.0) < TRUSTED:
         error = _doubted(fit, low, values, error)
     turned = partial(through, transpose=True)
@@ -273,8 +278,13 @@ def _doubted(fit: Fit, low: Discretization, values: Any, error: Any) -> Any:
 
 
 def between_orders(higher: Any, below: Any, values: Any) -> Any:
-    """The error (N, F) towards a higher order, or between it and that towards a lower one where this is smaller."""
+    """The error (N, F) towards a higher order, or between it and that towards a lower one where this is smaller.
+
+    A higher order that is farther away than the solution is large has lost it, and says nothing.
+    """
     far, near = (share(np.asarray(e), np.asarray(values)) for e in (higher, below))
+    if near < 1.0 < far:
+        return below
     return below * (far / near) ** DOUBT if 0.0 < near < far else higher
 
 

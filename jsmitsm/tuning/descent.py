@@ -64,6 +64,12 @@ class Descent:
         if self.space.by_support and len(self.retreats) < RETREATS and self._elsewhere(shown):
             self._descend(shown)
         self._tell_retreats()
+        self._tell_not_taken()
+
+    @property
+    def place(self) -> int:
+        """Where the best point stands among all."""
+        return next(k for k, point in enumerate(self.points) if point is self.best)
 
     def _descend(self, shown: Any) -> None:
         """Down from the best point, until nothing is gained any more or the steps are used up."""
@@ -114,6 +120,26 @@ class Descent:
             self.messages.append(f"Back to the best kernel with half the step, at step {at}: {reason}.")
         if len(self.retreats) == RETREATS:
             self.messages.append(f"Stopped after {RETREATS} steps back.")
+
+    def _tell_not_taken(self) -> None:
+        """The kernels with a smaller objective than the best one has, which the Lebesgue bound held off."""
+        smaller = [k for k, p in enumerate(self.points) if p.score.objective < self.best.score.objective]
+        if smaller:
+            k = min(smaller, key=lambda k: self.points[k].score.objective)
+            least, bound = self.points[k].score, self.objective.bound
+            self.messages.append(
+                f"Not taken: {len(smaller)} kernel(s) with objectives down to {least.objective:.3g} (place {k} of the "
+                f"history), whose Lebesgue constants, there {least.lebesgue:.3g}, are above the bound {bound:.3g}."
+            )
+
+    def tell_nearer(self, plain: Any) -> None:
+        """Say where the objective ``plain`` of a solve without a kernel is smaller than that of the best one."""
+        best = self.best.score.objective
+        if float(plain) < best - GAIN * abs(best):
+            self.messages.append(
+                f"Without a kernel js.solve, which weighs some stencils on their own, has the objective "
+                f"{float(plain):.3g}, and the best kernel {best:.3g}: leave the kernel out."
+            )
 
     # -- one step
 

@@ -168,21 +168,24 @@ class Objective:
     def score(self, kernel: Kernel) -> tuple[Any, Any]:
         """The score, and (objective, Lebesgue constant, defect, values, expansions); may be traced."""
         found, lebesgue, defect = self._solution(kernel)
+        value = self.measured(found)
+        score = value / self.scale if self.reference is None else jnp.log(value)
+        above = jnp.maximum(jnp.log(lebesgue / self.bound), 0.0)
+        score = score + PENALTY * (jnp.sum(above) if jnp.ndim(kernel.h) else jnp.max(above))
+        return score, (value, jnp.max(lebesgue), defect, found._values, found._fit.taylor)
+
+    def measured(self, found: Solution) -> Any:
+        """The objective of a solution, whoever made it."""
         if self.reference is None:
             value = self.target(found)
             number = isinstance(value, float | np.floating | jax.Array)
             if not number or jnp.shape(value) != () or not jnp.issubdtype(jnp.result_type(value), jnp.floating):
                 raise ValueError(f"objective: expected a function that returns a real scalar, got {value!r}")
-            score = value / self.scale
-        else:
-            size = np.sqrt(np.mean(self.reference**2, axis=0))
-            apart = (found._values - self.reference) / np.where(size > 0, size, 1.0)
-            # Round-off is no distance; the floor keeps the root differentiable at zero.
-            value = jnp.sqrt(jnp.mean(apart**2) + 1e-30)
-            score = jnp.log(value)
-        above = jnp.maximum(jnp.log(lebesgue / self.bound), 0.0)
-        score = score + PENALTY * (jnp.sum(above) if jnp.ndim(kernel.h) else jnp.max(above))
-        return score, (value, jnp.max(lebesgue), defect, found._values, found._fit.taylor)
+            return value
+        size = np.sqrt(np.mean(self.reference**2, axis=0))
+        apart = (found._values - self.reference) / np.where(size > 0, size, 1.0)
+        # Round-off is no distance; the floor keeps the root differentiable at zero.
+        return jnp.sqrt(jnp.mean(apart**2) + 1e-30)
 
     def _solution(self, kernel: Kernel) -> tuple[Solution, Any, Any]:
         """The solution on the pattern, every row's Lebesgue constant and defect."""

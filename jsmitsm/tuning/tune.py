@@ -20,7 +20,7 @@ from jsmitsm.equation.problem import Problem
 from jsmitsm.particle.kernels import Kernel
 from jsmitsm.runtime import notebooks
 from jsmitsm.runtime.arrays import ArrayLike, ValueOrFunction
-from jsmitsm.runtime.errors import did_you_mean, explaining, is_one_of, is_whole, listed, short
+from jsmitsm.runtime.errors import SolveError, did_you_mean, explaining, is_one_of, is_whole, listed, short
 from jsmitsm.runtime.progress import bar
 from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.solution.arguments import SolveOptions, check, discretized
@@ -56,9 +56,11 @@ class TuneResult:
         solution), ``"lebesgue"`` (the largest Lebesgue constant), and each tuned parameter under its name, (steps,)
         or (steps, N); ``"params"`` has the form of the kernel's own, every leaf with a leading axis of steps.
     messages : list of str
-        In words, where tuning had to step back, widen a support or stop.
+        In words, where tuning had to step back, widen a support or stop, and what it did not take.
     solves : int
         Number of solves, those of the reference and of the returned solution included.
+    step : int
+        Where in the history the returned kernel stands; smaller objectives there are of kernels that were not taken.
 
     Examples
     --------
@@ -77,16 +79,16 @@ class TuneResult:
     history: dict[str, Any]
     messages: list[str] = field(default_factory=list)
     solves: int = 0
+    step: int = 0
 
     def __repr__(self) -> str:
         seen = self.history["objective"]
-        best = np.nanmin(seen) if len(seen) else np.nan
-        return f"TuneResult({self.kernel!r}, objective {seen[0]:.3g} -> {best:.3g}, {self.solves} solves)"
+        return f"TuneResult({self.kernel!r}, objective {seen[0]:.3g} -> {seen[self.step]:.3g}, {self.solves} solves)"
 
     def _repr_html_(self) -> str:
         seen = np.asarray(self.history["objective"], float)
         rows: list[tuple[str, Any]] = [("kernel", repr(self.kernel)), ("steps, solves", f"{len(seen)}, {self.solves}")]
-        rows += [("objective", f"{seen[0]:.3g} to {np.nanmin(seen):.3g}")] if len(seen) else []
+        rows += [("objective", f"{seen[0]:.3g} to {seen[self.step]:.3g}")]
         rows += [("messages", " ".join(self.messages) or "none")]
         return notebooks.shown("TuneResult", rows) + self.solution._repr_html_()
 
@@ -168,8 +170,9 @@ def tune(
     """
     options: dict[str, Any] = {"method": "S", "order": 4, **solve_options}
     _check_input(problem, cloud, kernel, objective, optimizer, steps, options)
+    plain = None
     if kernel is None:
-        kernel = _chosen(problem, cloud, options)
+        kernel, plain = _chosen(problem, cloud, options)
         groups = np.zeros(len(cloud), int) if groups is None and "h" in parameters else groups
     names = _checked_names(kernel, parameters)
     kernel = kernel.recorded()
@@ -179,22 +182,34 @@ def tune(
         search = Descent(space, scored, optimizer, steps)
         search.run(shown)
         best = search.best
+        if plain is not None:
+            search.tell_nearer(scored.measured(plain))
         if not scored.linear:
             options["u0"] = best.score.values
         solution = solve(problem, cloud, kernel=best.kernel, **options)
-    return TuneResult(best.kernel.as_written(), solution, search.history(), search.messages, scored.solves + 1)
+    solves = scored.solves + 1 + (plain is not None)
+    return TuneResult(best.kernel.as_written(), solution, search.history(), search.messages, solves, search.place)
 
 
 # ------------------------------------------------------------------ input
 
 
-def _chosen(problem: Problem, cloud: Cloud, options: dict[str, Any]) -> Kernel:
-    """The kernel that ``js.solve`` takes where none is given."""
+def _chosen(problem: Problem, cloud: Cloud, options: dict[str, Any]) -> tuple[Kernel, Solution | None]:
+    """The kernel that ``js.solve`` takes where none is given, and its solution where there is one.
+
+    It fits the stencils that were repaired too: narrower ones begin with the weak rows that a solve has mended.
+    """
     disc = discretized(
         problem, cloud, options["method"], options["order"], None, options.get("stencils"),
         depth=options.get("depth", "auto"),
     )  # fmt: skip
-    return default_kernel(disc.points, np.arange(len(cloud)), disc.stencils.indices, disc.scheme.decay)
+    near, plain = disc.stencils.indices, None
+    try:
+        plain = solve(problem, cloud, **options)
+        near = plain._fit.neighbours
+    except SolveError:
+        pass
+    return default_kernel(disc.points, np.arange(len(cloud)), near, disc.scheme.decay), plain
 
 
 def _checked_names(kernel: Kernel, parameters: Any) -> tuple[str, ...]:

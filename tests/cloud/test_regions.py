@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import jsmitsm as js
+from jsmitsm.runtime.errors import TooCoarse
 from jsmitsm.cloud.regions.region_cloud import RegionCloud
 from jsmitsm.solution.regions.located import located
 
@@ -142,6 +143,14 @@ def test_the_side_of_a_point_is_that_of_the_true_shape():
 def test_shapes_that_do_not_fit_are_named_with_the_remedy(shapes, told):
     with pytest.raises(ValueError, match=told):
         js.regions(shapes, BOX, 0.2)
+
+
+@pytest.mark.parametrize("thick", [1e-2, 1e-3, 1e-4])
+def test_a_layer_thinner_than_the_spacing_is_no_overlap(thick):
+    """Even where the probes that look for its boundary step over it."""
+    layers = {"brick": (0.0, 0.4), "foil": (0.4, 0.4 + thick), "wool": (0.4 + thick, 1.0)}
+    with pytest.raises(TooCoarse, match=r"'foil'\]: .*too small for"):
+        js.regions(layers, spacing=0.05)
 
 
 def test_bounds_and_spacing_are_asked_for():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jsmitsm as js
-from jsmitsm.discretization.periodic import with_corners
+from jsmitsm.discretization.periodic import periodic_images, with_corners
 
 wave = lambda x: jnp.sin(2 * jnp.pi * x[0]) * jnp.exp(x[-1])
 slope = js.condition(lambda u, x, n: n @ (js.grad(u)(x) - js.grad(wave)(x)))
@@ -50,6 +50,31 @@ def test_corners_that_cannot_be_moved_stay():
     by_hand = strip(corners=js.fix(corners, values[corners]))
     assert off(by_hand, cloud, 8) < 1e-5
     assert [len(with_corners(p, cloud).groups["left"]) for p in (strip(), by_hand)] == [11, 13]
+
+
+@pytest.mark.parametrize("method, most", [("S", 1e-5), ("III", 5e-3), ("SSPH", 2e-2)])
+def test_corners_that_are_one_are_one_unknown(method, most):
+    """The pair of the bottom has no corners: left with an equation each, two that fall on one another stated it twice,
+    which made SSPH singular."""
+    cloud = js.rectangle((0, 0), (1, 1), (13, 13))
+    exact = lambda x: jnp.sin(2 * jnp.pi * x[0]) * jnp.cos(2 * jnp.pi * x[1])
+    pde = lambda u, x: js.laplacian(u)(x) - u(x) - (js.laplacian(exact)(x) - exact(x))
+    sides = {"left": js.periodic("left", "right"), "bottom": js.periodic("bottom", "top")}
+    sol = js.solve(js.Problem(pde, sides), cloud, method=method)
+    corners = [int(np.argmin(np.linalg.norm(cloud.points - np.array(at), axis=1))) for at in np.ndindex(2, 2)]
+    assert np.ptp(np.asarray(sol.u)[corners]) == 0.0 and sol.stats["unknowns"] == 144
+    assert np.abs(sol.u - jax.vmap(exact)(cloud.points)).max() < most
+
+
+def test_a_corner_lends_the_value_that_it_is_given():
+    """Of two that are one it is the other that takes, whichever is held; two held ones stay as they are."""
+    cloud = js.rectangle((0, 0), (1, 1), (9, 9))
+    sides = {"left": js.periodic("left", "right"), "bottom": js.periodic("bottom", "top")}
+    low, high = (int(np.argmin(np.linalg.norm(cloud.points - np.array(at), axis=1))) for at in ((0, 0), (0, 1)))
+    for given, partners in (([low], (low, low)), ([high], (high, high)), ([low, high], (low, high))):
+        held = np.isin(np.arange(len(cloud)), given)
+        _, partner = periodic_images(js.Problem(lambda u, x: js.laplacian(u)(x), sides), cloud, held)
+        assert (partner[low], partner[high]) == partners
 
 
 def test_a_torus_has_no_sides():

@@ -262,6 +262,19 @@ def test_a_normal_and_the_time_are_known_by_their_names():
     assert np.array_equal(runs[0].u, runs[1].u) and runs[0].u[-1, 0] == 0.1
 
 
+def test_the_third_argument_of_a_condition_is_the_normal_whatever_its_name():
+    """As in js.solve; the time where it is called so."""
+    out = lambda u, x, n: n @ js.grad(u)(x) + u(x)
+    same = (js.condition(out), js.condition(lambda u, x, nu: out(u, x, nu)), js.condition(lambda u, x, q, k: out(u, x, q)))
+    runs = [js.evolve(js.Problem(lambda u, x, t, *k: js.dt(u)(x) - js.laplacian(u)(x), {**COOLING.bcs, "right": c},
+                                 params=params), ROD, 1.0, (0.0, 0.1), steps=4)
+            for c, params in zip(same, (None, None, 2.0))]  # fmt: skip
+    assert np.array_equal(runs[0].u, runs[1].u) and np.array_equal(runs[0].u, runs[2].u)
+    held = js.condition(lambda u, x, time: u(x) - time)
+    run = js.evolve(js.Problem(COOLING.pde, {**COOLING.bcs, "right": held}), ROD, 0.0, (0.0, 0.1), steps=4)
+    assert run.u[-1][ROD.groups["right"]] == pytest.approx(0.1)
+
+
 def test_a_wave_over_ten_periods():
     wave = lambda x, t: jnp.sin(jnp.pi * x[0]) * jnp.cos(jnp.pi * t)  # noqa: E731
     problem = js.Problem(lambda u, x, t: js.dt(u, 2)(x) - js.laplacian(u)(x), everywhere(ROD, js.dirichlet(0.0)))

@@ -66,6 +66,16 @@ def test_jumps_sources_and_values_that_move_are_met_at_every_moment():
         assert np.abs(run.u[-1, ids] - exact).max() < 1e-9  # round-off
 
 
+def test_the_normal_of_a_flux_has_any_name():
+    flux = {name: lambda u, x, nu, f=f: f(u, x, nu) for name, f in FLUX.items()}
+    runs = [
+        js.evolve(js.Problem({n: heat(n) for n in K}, {"boundary": js.dirichlet(lambda x, t: t), "a|b": js.interface(f)}),
+                  LAYERS, 0.0, t=(0.0, 0.1), steps=2, progress=False)
+        for f in (FLUX, flux)
+    ]  # fmt: skip
+    assert np.abs(runs[0].u[-1]).max() > 0.01 and np.array_equal(runs[0].u, runs[1].u)
+
+
 def test_what_several_regions_do_not_take_is_named():
     ends = {"boundary": js.dirichlet(0.0), "a|b": js.interface(FLUX)}
     rest = {"t": (0.0, 1.0), "steps": 2, "progress": False}

@@ -77,3 +77,36 @@ def test_where_no_higher_order_is_determined_a_lower_one_is_compared(monkeypatch
     error = np.abs(sol.u - np.asarray(jax.vmap(exact)(sol.cloud.points))).max()
     monkeypatch.setattr(Run, "local_rows", local_rows)
     assert error < sol.error_estimate().max() < 1000 * error
+
+
+FEW = [(lambda x: jnp.sin(2 * x[0] + 0.5) * jnp.exp(x[1]), 10, 0.3), (lambda x: jnp.exp(x[0]) * jnp.sin(x[1]), 8, 0.36)]
+
+
+@pytest.mark.parametrize("exact, order, spacing", FEW)
+def test_few_particles_of_which_a_higher_order_makes_nothing(exact, order, spacing):
+    """Rows of order p + 2 are there, and their solution is farther away than this one is large."""
+    ring = lambda u, x, n: u(x) + n @ js.grad(u)(x) - exact(x) - n @ jax.grad(exact)(x)
+    problem = js.Problem(
+        lambda u, x: js.laplacian(u)(x) - js.laplacian(exact)(x), {"boundary": js.condition(ring)}
+    )  # fmt: skip
+    cloud = js.from_sdf(js.sdf.circle((0.0, 0.0), 1.0), ((-1.1, -1.1), (1.1, 1.1)), spacing)
+    sol = js.solve(problem, cloud, order=order)
+    error = np.abs(sol.u - np.asarray(jax.vmap(exact)(cloud.points))).max()
+    assert 0.5 * error < sol.error_estimate().max() < 10 * error
+
+
+@pytest.mark.parametrize("seed", [0, 4, 24])
+def test_few_particles_whose_higher_order_is_singular(seed):
+    rng = np.random.default_rng(seed)
+    angle = np.linspace(0, 2 * np.pi, 14, endpoint=False)
+    rim = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    inside = rng.uniform(-1, 1, (100, 2))
+    inside = inside[np.linalg.norm(inside, axis=1) < 0.95][:25]
+    normals = np.concatenate([np.full(inside.shape, np.nan), rim])
+    groups = {"interior": np.arange(25), "rim": np.arange(25, 39)}
+    cloud = js.Cloud(np.concatenate([inside, rim]), groups=groups, normals=normals)
+    exact = FEW[0][0]
+    problem = js.Problem(lambda u, x: js.laplacian(u)(x) - js.laplacian(exact)(x), {"rim": js.dirichlet(exact)})
+    sol = js.solve(problem, cloud, order=6)
+    error = np.abs(sol.u - np.asarray(jax.vmap(exact)(cloud.points))).max()
+    assert 0.5 * error < sol.error_estimate().max() < 10 * error

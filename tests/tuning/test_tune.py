@@ -3,6 +3,8 @@
 All on one line of 15 particles, so that compiled programs are shared.
 """
 
+import re
+from types import SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
@@ -13,6 +15,7 @@ import jsmitsm as js
 from jsmitsm.particle import batches
 from jsmitsm.tuning import objective as score_room
 from jsmitsm.tuning import tune as room
+from jsmitsm.tuning.descent import Descent
 from jsmitsm.tuning.objective import Objective, hand_kernel, reference
 
 N = 15
@@ -275,6 +278,62 @@ def test_a_nonlinear_problem():
 def test_bad_input(change, said):
     with pytest.raises(ValueError, match=said):
         tuned(js.SuperGaussian(s, 4.0), **change)
+
+
+def rough():
+    """Method III where js.solve repairs some of the stencils."""
+    plane = lambda x: jnp.sin(4 * x[0] + 0.5) * jnp.exp(x[1])
+    square = js.rectangle((0, 0), (1, 1), (9, 9), jitter=0.3)
+    ends = {side: js.dirichlet(plane) for side in ("left", "right", "bottom", "top")}
+    return js.Problem(lambda u, x: js.laplacian(u)(x) - js.laplacian(plane)(x), ends), square
+
+
+def test_what_is_told_is_of_the_kernel_that_is_returned(result):
+    """Not of another with a smaller objective that was not taken."""
+    history = {"objective": np.array([4.0, 0.25, 2.0])}
+    told = js.TuneResult(result.kernel, result.solution, history, step=2)
+    assert "objective 4 -> 2," in repr(told) and "4 to 2" in told._repr_html_() and "0.25" not in told._repr_html_()
+    gauge = Objective(problem, cloud, result.kernel, "estimate", {"method": "SSPH", "order": 2})
+    at = result.history["objective"][result.step]
+    assert float(gauge.measured(result.solution)) == pytest.approx(at, rel=1e-6)
+    assert (result.history["h"][result.step], result.history["d"][result.step]) == (result.kernel.h, result.kernel.d)
+
+
+def searched(*found, best):
+    """A search that has evaluated kernels with these objectives and Lebesgue constants."""
+    search = Descent.__new__(Descent)
+    search.points = [SimpleNamespace(score=SimpleNamespace(objective=o, lebesgue=l)) for o, l in found]
+    search.best, search.messages, search.objective = search.points[best], [], SimpleNamespace(bound=9.0)
+    return search
+
+
+def test_kernels_that_the_bound_holds_off_are_told():
+    search = searched((4.0, 9.0), (1.0, 22.0), (0.5, 82.0), (5.0, 7.0), best=0)
+    search._tell_not_taken()
+    assert search.place == 0 and len(search.messages) == 1
+    said = r"^Not taken: 2 kernel\(s\) .* down to 0.5 \(place 2 of the history\).* there 82, are above the bound 9\.$"
+    assert re.match(said, search.messages[0])
+    search = searched((4.0, 9.0), (1.0, 8.0), best=1)
+    search._tell_not_taken()
+    assert search.place == 1 and not search.messages
+
+
+def test_a_solve_without_a_kernel_that_is_nearer_is_told():
+    search = searched((2.0, 1.0), best=0)
+    search.tell_nearer(1.999)
+    assert not search.messages
+    search.tell_nearer(1.0)
+    assert "leave the kernel out" in search.messages[0]
+
+
+def test_it_starts_from_the_stencils_that_solve_repaired():
+    """Its start is as near to the reference as js.solve, and so is what is returned."""
+    posed, square = rough()
+    plain = js.solve(posed, square, method="III")
+    found = room.tune(posed, square, method="III", steps=1, progress=False)
+    gauge = Objective(posed, square, found.kernel, "estimate", {"method": "III", "order": 4})
+    assert found.history["objective"][0] == pytest.approx(float(gauge.measured(plain)), rel=1e-6)
+    assert found.history["objective"][found.step] <= found.history["objective"][0]
 
 
 def test_the_kernel_of_solve_where_none_is_given():

@@ -20,8 +20,6 @@ _LEVELS = 4
 _FAR, _STRIDES = 1.0, 8
 # Looks for the line between two sides along a ray, and for the end of a way.
 _LOOKS, _NEWTON = 8, 60
-# A way that meets the boundary at a smaller angle (its cosine) would count for too much.
-_GRAZING = 0.02
 # The corners of a triangle and the middles of the opposite sides; its quarters.
 _SPOTS = np.array([[2, 0, 0], [0, 2, 0], [0, 0, 2], [0, 1, 1], [1, 0, 1], [1, 1, 0]]) / 2.0
 _QUARTERS = _SPOTS[[[0, 5, 4], [5, 1, 3], [4, 3, 2], [3, 4, 5]]]
@@ -47,8 +45,11 @@ def open_ways(points: np.ndarray, facets: np.ndarray, normal: np.ndarray, own: n
     return np.where(at[:, None], mean, own)[facets], at[facets].any(axis=1)
 
 
-def over_edges(shape: Any, corners: np.ndarray, ways: np.ndarray, normal: np.ndarray, degree: int) -> Swept:
-    """Gauss points, one in each row, of facets (M, 3, 3) with their ways and outward normals (M, 3), by the shape.
+def over_edges(
+    shape: Any, corners: np.ndarray, ways: np.ndarray, normal: np.ndarray, degree: int
+) -> tuple[Swept, np.ndarray]:
+    """Gauss points of facets (M, 3, 3) with their ways and outward normals (M, 3), one in each row, by the shape; and
+    the facets (P,) they are of.
 
     A triangle that an edge parts into one corner and two is summed along rays from that corner, either side of the
     edge by itself: then the sums converge as fast as on smooth sides. Others are quartered.
@@ -76,13 +77,10 @@ def over_edges(shape: Any, corners: np.ndarray, ways: np.ndarray, normal: np.nda
     weights = np.concatenate([piece[2] * piece[3] for piece in found])
     reach, outward, _ = rays.ends(facet, at)
     base, way = rays.starts(facet, at)
-    # A way that grazes the boundary is lengthened no further.
-    steep = np.einsum("pd,pd->p", way, outward)
-    weights = weights * np.maximum(steep, 0.0) / np.maximum(steep, _GRAZING)
     sides, turns = (x[:, 1:] - x[:, :1] for x in (corners, ways))
     handed = np.sign(np.linalg.det(np.concatenate([sides, normal[:, None]], axis=1)))
     return Swept(base[:, None], way[:, None], reach[:, None], weights[:, None], sides[facet], turns[facet],
-                 handed[facet, None], outward[:, None])  # fmt: skip
+                 handed[facet, None], outward[:, None]), facet  # fmt: skip
 
 
 def _alone(alike: np.ndarray, k: int) -> np.ndarray:
@@ -156,7 +154,8 @@ class _Rays:
         live = np.flatnonzero(there & ~on)
         inner, outer = np.where(sense > 0, last, beyond), np.where(sense > 0, beyond, last)
         reach[live], outward[live] = self._root(base[live], way[live], inner[live], outer[live])
-        outward[~there] = self._normal[facet[~there]]
+        lost = self._normal[facet[~there]]
+        outward[~there] = np.copysign(1.0, np.einsum("pd,pd->p", lost, way[~there]))[:, None] * lost
         return reach, outward, there
 
     def _root(

@@ -156,7 +156,7 @@ def _shared(shapes: dict[str, Shape], spacing: Spacing, seed: int) -> _Sketch:
             new &= _apart(own.points, points[taken], spacing)
         made = np.arange(len(points), len(points) + int(new.sum()))
         direction = outward(shape, points[taken], spacing)
-        _check_corners(shape, name, own, new, points[taken], tolerance)
+        _check_corners(shape, name, own, new, points[taken], probing)
         points = np.concatenate([points, own.points[new]])
         on[name] = np.concatenate([taken, made])
         normals[name] = np.concatenate([direction, own.normals[new]])
@@ -181,9 +181,12 @@ def _apart(points: np.ndarray, others: np.ndarray, spacing: Spacing) -> np.ndarr
 
 
 def _check_corners(
-    shape: Shape, name: str, own: levelset.Boundary, new: np.ndarray, taken: np.ndarray, tolerance: float
+    shape: Shape, name: str, own: levelset.Boundary, new: np.ndarray, taken: np.ndarray, probing: Spacing
 ) -> None:
-    """What a shape leaves to earlier ones must have been made by them: nearby, at the least."""
+    """What a shape leaves to earlier ones must have been made by them: nearby, at the least.
+
+    A shape thinner than the probes does not find its own boundary, and so nothing that others have made of it.
+    """
     left = own.points[~new]
     if not len(left):
         return
@@ -192,6 +195,8 @@ def _check_corners(
     away = cKDTree(taken).query(left)[0] if len(taken) else np.full(len(left), np.inf)
     gap = np.median(cKDTree(own.points).query(own.points, k=2)[0][:, 1]) if len(own.points) > 1 else np.inf
     if (away > 2.0 * gap).any():
+        if not on_boundary(shape, left, probing, np.inf).all():
+            raise _too_small(name)
         raise ValueError(
             f"shapes[{name!r}]: lies on the zero level of another shape at {left[away.argmax()]}, which is no part of "
             "that one's boundary; overlapping regions? subtract one from the other with js.sdf.difference"
@@ -319,10 +324,7 @@ def _filled(sketch: _Sketch, seed: int, uniform: bool) -> dict[str, np.ndarray]:
         else:
             inside[name] = filling.fill(shape, sketch.spacing, shape.lo, shape.hi, boundary, seed, uniform)
         if not len(inside[name]):
-            raise TooCoarse(
-                f"shapes[{name!r}]: the region is too small for the spacing, no particle fits between those of its "
-                "boundary; reduce the spacing there (it may be a function of the position)"
-            )
+            raise _too_small(name)
         for other, there in sketch.shapes.items():
             if other != name:
                 deep = there.distance(inside[name])[0]
@@ -333,6 +335,13 @@ def _filled(sketch: _Sketch, seed: int, uniform: bool) -> dict[str, np.ndarray]:
                         "other with js.sdf.difference, or correct the polygons"
                     )
     return inside
+
+
+def _too_small(name: str) -> TooCoarse:
+    return TooCoarse(
+        f"shapes[{name!r}]: the region is too small for the spacing, no particle fits between those of its boundary; "
+        "reduce the spacing there (it may be a function of the position)"
+    )
 
 
 def _put_together(sketch: _Sketch, inside: dict[str, np.ndarray], groups: Any) -> RegionCloud:

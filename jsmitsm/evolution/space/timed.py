@@ -263,8 +263,9 @@ def in_time(function: Callable[..., Any], with_params: bool, forms: Any, where: 
 def _takes(function: Callable[..., Any], count: int, names: str, named: bool) -> bool:
     """Whether a function takes so many arguments, those of these names.
 
-    Numbers kept in defaults, as in lambda x, c=c: c * x[0], do not take the place of the time. An argument called t is
-    the time and one called n the normal, and so no other; named: and the time is called so.
+    Numbers kept in defaults, as in lambda x, c=c: c * x[0], do not take the place of the time nor of the normal. An
+    argument called t is the time and one called n the normal, and so no other. Else it is the place that counts, as in
+    js.solve: the third argument of a condition is the normal, whatever its name. named: time and normal are called so.
     """
     try:
         signature = inspect.signature(function)
@@ -274,15 +275,14 @@ def _takes(function: Callable[..., Any], count: int, names: str, named: bool) ->
     except ValueError:  # a callable without a signature
         return not named
     meant = names.split(", ")
-    given = list(signature.parameters.values())[:count]
-    if names == "u, x, n" and given[2].name not in NORMAL:
-        return False
-    for k, one in enumerate(given):
-        role = meant[k] if k < len(meant) else ""
-        if one.name in TIMES and one.default is inspect.Parameter.empty and role != "t":
+    for k, one in enumerate(list(signature.parameters.values())[:count]):
+        role, kept = meant[k] if k < len(meant) else "", one.default is not inspect.Parameter.empty
+        if one.name in TIMES and not kept and role != "t":
             return False
         if one.name in NORMAL and role not in ("n", ""):
             return False
-        if role == "t" and one.name not in TIMES and (named or one.default is not inspect.Parameter.empty):
+        if role == "t" and one.name not in TIMES and (named or kept):
+            return False
+        if names == "u, x, n" and role == "n" and one.name not in NORMAL and (named or kept):
             return False
     return True
