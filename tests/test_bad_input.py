@@ -193,7 +193,7 @@ STENCILS = [
 
 PROBLEMS = [
     ("component-of-a-function", lambda: js.solve(js.Problem(
-        lambda u, x: js.laplacian(u)(x) + js.laplacian((lambda y: jnp.sin(y))[0])(x), ENDS), LINE), "pde:",
+        lambda u, x: js.laplacian(u)(x) + js.laplacian(poisson[0])(x), ENDS), LINE), "pde:",
      r"js.laplacian\(u\)\(x\)\[k\]"),
     ("dtype-number", lambda: js.Problem(poisson, ENDS, dtype=np.float32(0.3)), "dtype:", "float or complex"),
     ("pde-None", lambda: js.Problem(None, ENDS), "pde:", "function"),

@@ -11,7 +11,8 @@ import numpy as np
 
 from jsmitsm.adaptation.first_cloud import Make, first_cloud, refuse_no_maker
 from jsmitsm.adaptation.measure import NORMS, Quantity
-from jsmitsm.adaptation.rounds import ORDERS, Rounds
+from jsmitsm.adaptation.orders import ORDERS
+from jsmitsm.adaptation.rounds import Rounds
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.equation.problem import Problem
 from jsmitsm.equation.unknowns.extras import refuse_extras

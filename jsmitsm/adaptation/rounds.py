@@ -15,6 +15,7 @@ from jsmitsm.adaptation.free_ends import off_at_free_ends
 from jsmitsm.adaptation.layers import LOST, along_outflow
 from jsmitsm.adaptation.marking import FAR, ROUGH, SLOW, Marks, marks, next_spacing
 from jsmitsm.adaptation.measure import Measured, Quantity, measured, size, spent
+from jsmitsm.adaptation.orders import Orders
 from jsmitsm.adaptation.spacing_field import SpacingField
 from jsmitsm.adaptation.witness import Earlier, doubted, remembered, stands_out, unseen
 from jsmitsm.cloud.cloud import Cloud
@@ -24,18 +25,8 @@ from jsmitsm.solution.look.gaps import gaps
 from jsmitsm.solution.solution import Solution
 from jsmitsm.solution.solve import solve
 
-# Orders that may be used: two more are needed for the estimate, and two more for that of the check.
-ORDERS = tuple(range(1, 13))
-# With "auto": up to which tolerance an order serves, by dimension; while the error is rough, the first.
-_LADDER = {
-    1: ((1e-2, 4), (0.0, 8)),
-    2: ((2e-3, 4), (1e-5, 6), (0.0, 8)),
-    3: ((1e-3, 4), (0.0, 6)),
-}
 # Where smoothness ends along lines with so large a part of the particles, a higher order makes them dearer, no fewer.
 _LINES = 0.3
-# A rough solution that a round leaves with this part of its error gets no better by particles.
-_HOPE = 0.5
 # Polynomials of neighbours may differ between them by so many tolerances: they are off by so much more than the values.
 _GAP = 10.0
 # Where the values may be off by more than they are thought to be, they are off by so many times as much, no more: a
@@ -84,7 +75,8 @@ class Rounds:
         max_particles: int, max_rounds: int, options: dict[str, Any], began: float,
     ):  # fmt: skip
         self.problem, self.make, self.tol, self.quantity, self.norm = problem, make, tol, quantity, norm
-        self.max_particles, self.max_rounds, self.options, self.wanted_order = max_particles, max_rounds, options, order
+        self.max_particles, self.max_rounds, self.options = max_particles, max_rounds, options
+        self.orders = Orders(order, tol)
         self.clock = began
         self.solution: Solution = None  # type: ignore[assignment]
         self.spacing: SpacingField = None  # type: ignore[assignment]
@@ -97,15 +89,12 @@ class Rounds:
         self.messages: list[str] = []
         self.rows: list[growth.Row] = []
         self.data: Data | None = None
-        self.least, self.highest, self.shallow = 1, ORDERS[-1], False
         self.before: Marks | None = None
         self.earlier: Earlier | None = None
         self.best: tuple[int, float, SpacingField] | None = None  # order, error and spacing of the best round so far
         self.apart: np.ndarray | None = None  # gaps between neighbours, where they are what is wrong
         self.least_error: Ended | None = None
-        self.lowered: tuple[int, float] | None = None  # order and error before the order was lowered
         self.lined = False  # whether smoothness ends along lines that hold most particles, whatever the order
-        self.hopeful = False  # whether that was no remedy, and more particles are what is left
 
     def history(self) -> dict[str, np.ndarray]:
         names = ("particles", "order", "error", "seconds", "smallest")
@@ -120,11 +109,15 @@ class Rounds:
             self.messages.append(f"The last round was worse, {self.error:.1e}: this is the best one.")
             self.error, self.solution, self.number = best
             self.flags = []
+        if self.quantity is not None and self.number_before is None and not self.reached:
+            # A number of one cloud is no nearer to the truth than its solution, as far as anybody knows.
+            values, error = (np.asarray(v) for v in (self.solution.u, self.solution.error_estimate()))
+            self.error = max(self.error, size(error, values, np.ones(len(values)), "max", self.solution.cloud.dim))
 
     def _search(self, cloud: Cloud, spacing: SpacingField, shown: Any) -> None:
         self.data = data_of(self.problem, cloud.dim, _DEGREE)
         if self.data is not None:
-            self.least = max(self.data.traced.order)
+            self.orders.least = max(self.data.traced.order)
             spacing, cloud = looked_at(self.data, self._cloud, cloud, spacing, self.max_particles // 4)
         refused = 0
         for number in range(self.max_rounds):
@@ -174,7 +167,7 @@ class Rounds:
             self.flags = self.solution.flags
 
     def _solved(self, cloud: Cloud, spacing: SpacingField) -> tuple[Solution, Measured]:
-        order = self._order(cloud)
+        order = self.orders.following(self.rows, cloud.dim, self.lined)
         sol = self._solve(cloud, order)
         h = spacing(np.asarray(cloud.points))
         found = measured(sol, h, self._operator_order(sol), self.norm, self.quantity)
@@ -201,36 +194,19 @@ class Rounds:
         self.clock = now
 
     def _solve(self, cloud: Cloud, order: int, start: Any = None) -> Solution:
-        options = dict(self.options)
+        depth = 0 if self.orders.shallow else "auto"
+        options = {"order": order, "throw": True, "depth": depth, **self.options}
         if start is None and self.solution is not None and self.solution.iterations != 1 and self.solution.converged:
             start = np.asarray(self.solution(np.asarray(cloud.points), outside="extrapolate"))
-        if start is not None:
-            options["u0"] = start
-        depth = 0 if self.shallow else "auto"
-        return solve(self.problem, cloud, order=order, throw=True, **{"depth": depth, **options})
+        if start is None:
+            return solve(self.problem, cloud, **options)
+        try:
+            return solve(self.problem, cloud, **{**options, "u0": start})
+        except SolveError:  # the solution before may be farther from this one than what it began with itself
+            return solve(self.problem, cloud, **options)
 
     def _operator_order(self, sol: Solution) -> int:
         return max(sol.operator_orders, default=2)  # several regions do not tell
-
-    # ------------------------------------------------------------------ orders
-
-    def _order(self, cloud: Cloud) -> int:
-        if self.wanted_order != "auto":
-            return int(self.wanted_order)
-        ladder = _LADDER[cloud.dim]
-        wanted = next(order for limit, order in ladder if self.tol >= limit)
-        if not self.rows or self.rows[-1][2] > ROUGH or self.lined:
-            wanted = min(wanted, ladder[0][1])
-        last = self.rows[-1] if self.rows else (0, 0, 0.0, 0.0, 0.0)
-        # Lower orders were no remedy, or the solution is rough no more.
-        if self.lowered is not None and last[1] < self.lowered[0] and not _HOPE * ROUGH <= last[2] <= self.lowered[1]:
-            self.highest, self.shallow, self.hopeful = self.lowered[0], False, True
-        elif len(self.rows) > 1 and last[2] > max(ROUGH, _HOPE * self.rows[-2][2]) and not self.hopeful:
-            # More particles do not help: Taylor series of something that is not smooth. First the depth is too much.
-            self.lowered = last[1], last[2]
-            self.highest = min(self.highest, max(last[1] - 2 * self.shallow, self.least))
-            self.shallow = True
-        return max(min(wanted, self.highest), self.least)
 
     # ------------------------------------------------------------------ clouds
 
@@ -336,7 +312,7 @@ class Rounds:
         most = growth.most(len(cloud), cloud.dim, self.max_particles, self.lined)
         wanted = _EASED * self.tol if apart is not None else self.tol if self.error > self.tol else 0.5 * error
         if self.lined:
-            wanted *= _DEAR
+            wanted *= _DEAR * min(1.0, self.undoubted / self.error)
         elif here.singular.any() and error <= _AIMED * FAR * self.tol:  # the estimate will be doubted there, soon
             wanted *= _AIMED
         made_h, _ = next_spacing(here, power, error, wanted, most, found.gathered, found.missed)

@@ -181,7 +181,7 @@ def _placed(
         for group in groups:
             held[group.ids[:, None], list(group.held)] = True
             n_own[group.ids] = group.n_rows + len(group.held)
-        images, partner = periodic_images(problem, cloud, held.all(axis=1))
+        images, partner = periodic_images(problem, cloud, np.asarray(held.all(axis=1)))
         held[partner != np.arange(len(cloud))] = True
         if len(images.owner) and scheme.method in ("I", "II"):
             raise ValueError(f"method: {scheme.method} does not follow periodic conditions; use S, III or SSPH")

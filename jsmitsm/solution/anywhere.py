@@ -230,7 +230,9 @@ class Anywhere(Copied):
 
     @explaining
     def flux(self, group: str, conductivity: ValueOrFunction = 1.0) -> jax.Array:
-        """The integral of conductivity n . grad u over a boundary group, n outward; of the order of the solution.
+        """The integral of conductivity n . grad u over a boundary group, n outward.
+
+        Of the order of the solution, but at the edges of solids; ``js.quadrature`` says what holds there.
 
         Parameters
         ----------

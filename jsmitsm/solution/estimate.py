@@ -97,17 +97,16 @@ def correction(fit: Fit, values: Any, made: Run | None = None) -> Correction:
 
     is what leads to the solution of order p + 2, or of a lower one where that knows nothing more (see ``compared``).
     Where that matrix is singular a lower order is compared with, which is off by as much as p, or more. For those who
-    ask what each particle contributes, and where no order is lower, the defect is taken through the solution's own: A_p^-1 D (b_{p+2} - A_{p+2} u_p). D brings the rows of the two orders to one scale, that of the
-    source in them, and rows of one-sided stencils count less: they amplify what order p + 2 misses itself.
-    Solutions of other methods, whose rows are no such predictions, and of the least-squares form, whose rows have no
-    common scale, are compared with that of method S of order p + 2 (in that form see ``_by_misfits``). Held values
-    have no error; where p + 2 is no better than p (no smoothness, or round-off) the estimate says little.
+    ask what each particle contributes, and where no order is lower, the defect is taken through the solution's own:
+    A_p^-1 D (b_{p+2} - A_{p+2} u_p). D brings the rows of both orders to one scale, that of the source in them; rows of
+    one-sided stencils count less: they amplify what order p + 2 misses itself. Solutions of other methods, and of the
+    least-squares form, whose rows are no such predictions or have no common scale, are compared with that of method S
+    of order p + 2 (see ``_by_misfits``). Held values have no error; where p + 2 is no better the estimate says little.
     """
     low = fit.discretization()
 
-    @cache
-    def nums() -> Numbers:
-        return numbers(low, fit.problem, fit.taylor) if made is None or made.nums is None else made.nums
+    known = None if made is None else made.nums
+    nums = cache(lambda: numbers(low, fit.problem, fit.taylor) if known is None else known)
 
     if fit.recipe.formulation == "lsq" or fit.recipe.method != "S":
         return _against(fit, low, values, nums)
@@ -116,12 +115,10 @@ def correction(fit: Fit, values: Any, made: Run | None = None) -> Correction:
     above = Run(high, fit.problem, "auto", True, True, "loo")
     try:
         high_rows = above.local_rows(high_nums)
-    except SolveError:  # too few neighbours for so high an order: a lower one is off by as much as p, or more
-        below = lower(fit.recipe.order, max(low.rec.orders))
-        if below == fit.recipe.order:
+    except SolveError:  # too few neighbours for so high an order
+        if (below := _below(fit, low, values)) is None:
             raise
-        error, units, _ = _towards(fit, low, values, below)
-        return Correction(error, error, None, None, units)
+        return Correction(below[0], below[0], None, None, below[1])
     entries = matrix(high, *high_rows)
     residual = _residual(high, *high_rows, high_nums, entries, values)
     trust = _trust(high, *high_rows)
@@ -152,12 +149,8 @@ def correction(fit: Fit, values: Any, made: Run | None = None) -> Correction:
         x, _ = above.solved(*entries, residual, balanced=False)
         error = towards = spread(x)
     except SolveError:  # as on few particles
-        below = lower(fit.recipe.order, max(low.rec.orders))
-        if below < fit.recipe.order:
-            error = towards = _towards(fit, low, values, below)[0]
-        else:
-            x, _ = run.solved(*matrix(low, *own()), defect().reshape(-1)[free], balanced=False)
-            error = towards = spread(x)
+        below = _below(fit, low, values)
+        error = towards = through(defect()) if below is None else below[0]
     if order > fit.recipe.order >= HIGH and not is_traced(error, trust) and trust.min(initial=1.0) < TRUSTED:
         error = _doubted(fit, low, values, error)
     turned = partial(through, transpose=True)
@@ -267,14 +260,17 @@ def _doubted(fit: Fit, low: Discretization, values: Any, error: Any) -> Any:
     not that of p; a lower order, at worst as bad as p there, is off by about as much as p. Under a JAX transform nobody
     is asked again.
     """
-    order = lower(fit.recipe.order, max(low.rec.orders))
-    if order == fit.recipe.order:
-        return error
     try:
-        other, _, _ = _towards(fit, low, values, order)
+        below = _below(fit, low, values)
     except SolveError:
         return error
-    return between_orders(error, other, values)
+    return error if below is None else between_orders(error, below[0], values)
+
+
+def _below(fit: Fit, low: Discretization, values: Any) -> tuple[Any, Any] | None:
+    """What leads to a lower order, which is off by as much as p, or more, and units; None where no order is lower."""
+    order = lower(fit.recipe.order, max(low.rec.orders))
+    return None if order == fit.recipe.order else _towards(fit, low, values, order)[:2]
 
 
 def between_orders(higher: Any, below: Any, values: Any) -> Any:

@@ -137,8 +137,8 @@ class Descent:
         best = self.best.score.objective
         if float(plain) < best - GAIN * abs(best):
             self.messages.append(
-                f"Without a kernel js.solve, which weighs some stencils on their own, has the objective "
-                f"{float(plain):.3g}, and the best kernel {best:.3g}: leave the kernel out."
+                f"Without a kernel js.solve, which balances single stencils, has the objective {float(plain):.3g}, the "
+                f"best kernel {best:.3g}: leave the kernel out."
             )
 
     # -- one step

@@ -121,7 +121,8 @@ def tune(
         The particles it is solved on.
     kernel : Kernel, optional
         Where to start. ``h`` scalar, or (N,) to tune one smoothing length per particle. If not given, what
-        ``js.solve`` takes, its smoothing lengths by one factor unless ``groups`` says otherwise.
+        ``js.solve`` takes, its smoothing lengths by one factor unless ``groups`` says otherwise. Stencils that it
+        balances between directions are no kernel's support: where they stay ahead of the best, a message says so.
     objective : "estimate" or function
         "estimate", the distance to a reference solution of higher order that is computed once; or a function of a
         ``js.Solution`` that returns a scalar to be made small. Both are held by a bound on the Lebesgue

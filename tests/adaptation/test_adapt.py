@@ -442,27 +442,42 @@ def test_the_best_round_is_handed_out():
 
 
 def test_a_lower_order_that_does_worse_is_given_up():
-    search, cloud = a_search(), js.interval(0.0, 1.0, 11)
+    search = a_search()
     search.rows = [(10, 4, 3.0, 0.0, 0.1), (20, 4, 1.6, 0.0, 0.1)]
-    search.least = 2
-    assert search._order(cloud) == 4 and search.shallow  # the depth goes first
+    search.orders.least = 2
+    assert search.orders.following(search.rows, 1, False) == 4 and search.orders.shallow  # the depth goes first
     search.rows.append((40, 4, 1.5, 0.0, 0.1))
-    assert search._order(cloud) == 2 and search.shallow
+    assert search.orders.following(search.rows, 1, False) == 2 and search.orders.shallow
     search.rows.append((80, 2, 100.0, 0.0, 0.1))
-    assert search._order(cloud) == 4 and not search.shallow
+    assert search.orders.following(search.rows, 1, False) == 4 and not search.orders.shallow
     search.rows.append((160, 4, 90.0, 0.0, 0.1))
-    assert search._order(cloud) == 4
+    assert search.orders.following(search.rows, 1, False) == 4
 
 
 def test_a_lower_order_is_left_where_nothing_is_rough_any_more():
     """A spike at a vertex of which the first clouds saw nothing ended at order 2, far from its tolerance."""
-    search, cloud = a_search(), js.interval(0.0, 1.0, 11)
-    search.rows, search.least, search.shallow = [(20, 4, 1.6, 0.0, 0.1), (40, 4, 1.5, 0.0, 0.1)], 2, True
-    assert search._order(cloud) == 2
+    search = a_search()
+    search.rows = [(20, 4, 1.6, 0.0, 0.1), (40, 4, 1.5, 0.0, 0.1)]
+    search.orders.least, search.orders.shallow = 2, True
+    assert search.orders.following(search.rows, 1, False) == 2
     search.rows.append((80, 2, 0.2, 0.0, 0.1))
-    assert search._order(cloud) == 2
+    assert search.orders.following(search.rows, 1, False) == 2
     search.rows.append((160, 2, 0.1, 0.0, 0.1))
-    assert search._order(cloud) == 4 and not search.shallow
+    assert search.orders.following(search.rows, 1, False) == 4 and not search.orders.shallow
+
+
+def test_a_steep_layer_of_a_nonlinear_equation():
+    """u'' = k^2 sinh u, where the solution on the first cloud is no start for the next: the user's own is."""
+    k, held = 30.0, 6.0
+    exact = lambda x: 4 * jnp.arctanh(jnp.tanh(held / 4) * jnp.exp(-k * x[0]))
+    problem = js.Problem(
+        lambda u, x: js.laplacian(u)(x) - k**2 * jnp.sinh(u(x)), {"left": js.dirichlet(held), "right": js.dirichlet(exact)}
+    )
+    slope = -2 * k * np.sinh(held / 2)
+    found = js.adapt(problem, line, 1e-6, quantity=lambda sol: sol.flux("left"))
+    assert found.reached and abs(found.quantity / -slope - 1) < 1e-6
+    first = js.adapt(problem, line, 1e-6, quantity=lambda sol: sol.flux("left"), max_rounds=1)
+    assert not first.reached and first.error > 1e-2  # the estimate of the number alone says 1e-6
 
 
 def test_numbers_that_move_more_than_was_thought_are_not_believed():

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import jsmitsm as js
-from jsmitsm.runtime.errors import TooCoarse
 from jsmitsm.cloud.regions.region_cloud import RegionCloud
+from jsmitsm.runtime.errors import TooCoarse
 from jsmitsm.solution.regions.located import located
 
 BOX = ((-1.0, -1.0), (1.0, 1.0))

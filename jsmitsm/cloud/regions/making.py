@@ -183,10 +183,7 @@ def _apart(points: np.ndarray, others: np.ndarray, spacing: Spacing) -> np.ndarr
 def _check_corners(
     shape: Shape, name: str, own: levelset.Boundary, new: np.ndarray, taken: np.ndarray, probing: Spacing
 ) -> None:
-    """What a shape leaves to earlier ones must have been made by them: nearby, at the least.
-
-    A shape thinner than the probes does not find its own boundary, and so nothing that others have made of it.
-    """
+    """What a shape leaves to earlier ones must have been made by them: nearby, at the least."""
     left = own.points[~new]
     if not len(left):
         return
@@ -195,7 +192,7 @@ def _check_corners(
     away = cKDTree(taken).query(left)[0] if len(taken) else np.full(len(left), np.inf)
     gap = np.median(cKDTree(own.points).query(own.points, k=2)[0][:, 1]) if len(own.points) > 1 else np.inf
     if (away > 2.0 * gap).any():
-        if not on_boundary(shape, left, probing, np.inf).all():
+        if not on_boundary(shape, left, probing, np.inf).all():  # the probes step over the shape
             raise _too_small(name)
         raise ValueError(
             f"shapes[{name!r}]: lies on the zero level of another shape at {left[away.argmax()]}, which is no part of "
