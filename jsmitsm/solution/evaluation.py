@@ -13,7 +13,7 @@ from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.cloud.inside import Nearest, inside_of
 from jsmitsm.particle.polynomials import derivative_table, monomials, monomials_on_host
 from jsmitsm.runtime.errors import refuse_masked
-from jsmitsm.runtime.tracers import is_traced
+from jsmitsm.runtime.tracers import concrete, is_traced
 
 # Points evaluated at a time.
 _AT_ONCE = 4096
@@ -38,6 +38,8 @@ def in_domain(cloud: Cloud, points: Any, outside: str, first: Nearest | None = N
                 "before the transform"
             )
         return ~beyond
+    if cloud._shape is not None and beyond.any():  # which knows, where particles of two sides are near each other
+        beyond[beyond] = cloud._shape.distance(np.asarray(concrete(points), float)[beyond])[0] > 0.0
     if not beyond.any():
         return None
     if outside == "raise":

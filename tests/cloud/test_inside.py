@@ -213,3 +213,15 @@ def test_a_table_finds_the_nearest_particles_of_a_tree():
         found = table.nearest(some)
         np.testing.assert_array_equal(found.number, number)
         np.testing.assert_allclose(found.distance, distance, rtol=1e-14)
+
+
+def test_a_cut_thinner_than_the_spacing():
+    """Both of its sides are near every point beside it; the polygon knows on which it is."""
+    half = 0.005
+    vertices = [(0, 0), (2, 0), (2, 0.5 - half), (0.5, 0.5 - half), (0.5, 0.5 + half), (2, 0.5 + half), (2, 1), (0, 1)]
+    cloud = js.from_polygon(vertices, 0.1)
+    exact = lambda x: jnp.exp(x[0]) * jnp.sin(x[1])
+    sol = js.solve(js.Problem(lambda u, x: js.laplacian(u)(x), {"boundary": js.dirichlet(exact)}), cloud)
+    points = np.random.default_rng(0).uniform((0.55, 0.4), (1.95, 0.6), (4000, 2))
+    values, cut = np.asarray(sol(points)), np.abs(points[:, 1] - 0.5) < half
+    assert np.abs(values - np.asarray(jax.vmap(exact)(points)))[~cut].max() < 1e-3
