@@ -194,8 +194,6 @@ def evolve(
             return march(run, None if steps is None else int(steps), None if tol is None else float(tol), parts, shown)
 
 
-
-
 def _refuse_readapt(readapt: Any, several: bool, stencils: Any, made: Any, traced: bool) -> None:
     if not isinstance(readapt, Readapt):
         raise ValueError(f"readapt: expected js.Readapt(make, tol), got {short(readapt)}")

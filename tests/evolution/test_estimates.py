@@ -108,6 +108,19 @@ def test_smooth_starts_and_arrays_are_not_doubted():
         assert run.flags == [] and run.error_estimate().max() < 1e-3
 
 
+def test_nobody_looks_across_a_gap():
+    """The angle in a ring that is cut, with a jump across the cut alone: nothing of it is between the particles."""
+    angle = lambda x: jnp.mod(jnp.arctan2(x[1], x[0]), 2 * jnp.pi)
+    outer, inner = np.arcsin(0.01), np.arcsin(0.02)
+    rim = [(np.cos(a), np.sin(a)) for a in np.linspace(outer, 2 * np.pi - outer, 200)]
+    rim += [(0.5 * np.cos(a), 0.5 * np.sin(a)) for a in np.linspace(2 * np.pi - inner, inner, 120)]
+    pde = lambda u, x, t: js.dt(u)(x) - js.laplacian(u)(x) + angle(x) * jnp.exp(-t)
+    problem = js.Problem(pde, {"boundary": js.dirichlet(lambda x, t: angle(x) * jnp.exp(-t))})
+    run = js.evolve(problem, js.from_polygon(rim, 0.1), angle, t=(0.0, 1.0), steps=20)
+    error = np.abs(run.u[-1] - np.asarray(jax.vmap(angle)(run.cloud.points)) * np.exp(-1.0)).max()
+    assert 0.3 < run.error_estimate()[-1].max() / error < 10.0
+
+
 C = 0.4137  # where something jumps, between particles
 
 

@@ -265,7 +265,7 @@ def test_a_normal_and_the_time_are_known_by_their_names():
 def test_the_third_argument_of_a_condition_is_the_normal_whatever_its_name():
     """As in js.solve; the time where it is called so."""
     out = lambda u, x, n: n @ js.grad(u)(x) + u(x)
-    same = (js.condition(out), js.condition(lambda u, x, nu: out(u, x, nu)), js.condition(lambda u, x, q, k: out(u, x, q)))
+    same = [js.condition(f) for f in (out, lambda u, x, nu: out(u, x, nu), lambda u, x, q, k: out(u, x, q))]
     runs = [js.evolve(js.Problem(lambda u, x, t, *k: js.dt(u)(x) - js.laplacian(u)(x), {**COOLING.bcs, "right": c},
                                  params=params), ROD, 1.0, (0.0, 0.1), steps=4)
             for c, params in zip(same, (None, None, 2.0))]  # fmt: skip

@@ -68,11 +68,9 @@ def test_jumps_sources_and_values_that_move_are_met_at_every_moment():
 
 def test_the_normal_of_a_flux_has_any_name():
     flux = {name: lambda u, x, nu, f=f: f(u, x, nu) for name, f in FLUX.items()}
-    runs = [
-        js.evolve(js.Problem({n: heat(n) for n in K}, {"boundary": js.dirichlet(lambda x, t: t), "a|b": js.interface(f)}),
-                  LAYERS, 0.0, t=(0.0, 0.1), steps=2, progress=False)
-        for f in (FLUX, flux)
-    ]  # fmt: skip
+    held, options = js.dirichlet(lambda x, t: t), {"t": (0.0, 0.1), "steps": 2, "progress": False}
+    problems = [js.Problem({n: heat(n) for n in K}, {"boundary": held, "a|b": js.interface(f)}) for f in (FLUX, flux)]
+    runs = [js.evolve(problem, LAYERS, 0.0, **options) for problem in problems]
     assert np.abs(runs[0].u[-1]).max() > 0.01 and np.array_equal(runs[0].u, runs[1].u)
 
 

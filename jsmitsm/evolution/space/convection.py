@@ -6,10 +6,14 @@ from typing import Any
 
 import numpy as np
 
+from jsmitsm.cloud.neighbours import nearest
 from jsmitsm.discretization.parts.whole import Part
 from jsmitsm.discretization.pencil.fits import local_fits
-from jsmitsm.equation.field import unit
+from jsmitsm.equation.field import RATE, unit
+from jsmitsm.equation.traced import Traced
 from jsmitsm.evolution.space.semidiscrete import Semidiscrete
+from jsmitsm.evolution.space.timed import Timed
+from jsmitsm.runtime.collector import uncollected
 
 # Cell Peclet numbers |v| h / eps: up to the first the recursion is stable, beyond the second nothing is.
 MODERATE, MOST = 2.0, 5.0
@@ -24,6 +28,7 @@ def refuse_convection(semi: Semidiscrete, flags: list[str], part: Part | None = 
     """
     operator, problem = semi.timed.operator, semi.timed.problem
     whole = semi.timed.space
+    _refuse_waves(whole, _rated(semi.timed))
     for e, row in enumerate(whole.pattern):
         rates = any(p for m in semi.timed.masses for p in (m.pattern[e] if m.slots else ()))
         first = [s for s, (_, b) in enumerate(whole.slots) if row[s] and sum(b) == 1]
@@ -50,7 +55,11 @@ def refuse_convection(semi: Semidiscrete, flags: list[str], part: Part | None = 
         )  # fmt: skip
         diffusion = diffusion / np.sqrt(points.shape[1])
         with np.errstate(divide="ignore", invalid="ignore"):
-            worst = max(worst, float(np.nanmax(np.where(speed > 0, speed * spacing / diffusion, 0.0))))
+            cell = np.where(speed > 0, speed * spacing / diffusion, 0.0)
+        if (cell > MODERATE).any():
+            rate = np.abs(semi.timed.mass(1, points, problem.params)[:, e]).sum(axis=1)
+            cell = np.where(_vanish(points, rate, diffusion), 0.0, cell)
+        worst = max(worst, float(np.nanmax(cell)))
     worst = part.largest({"": worst})[""] if part else worst  # type: ignore[dict-item,assignment]
     if worst > MOST:
         raise ValueError(
@@ -91,6 +100,55 @@ def flag_open(semi: Semidiscrete, flags: list[str]) -> None:
             "errors may be some percent there: give the pressure, as at an outlet, or its slope along the normal, as "
             "the momentum equations have it."
         )
+
+
+def _vanish(points: np.ndarray, rate: np.ndarray, diffusion: np.ndarray) -> np.ndarray:
+    """Where (N,) both are less than half of what they are beside: within a spacing of an axis, or of another zero.
+
+    There the equation is a condition in itself, and its convection moves nothing.
+    """
+    near = np.asarray(nearest(points, min(2 * points.shape[1] + 1, len(points))).indices)
+    return np.all([2.0 * some < some[near].max(axis=1) for some in (rate, diffusion)], axis=0)
+
+
+def _rated(timed: Timed) -> np.ndarray:
+    """Which equation holds a rate of which field, (E, F)."""
+    found = np.zeros((timed.problem.fields, timed.problem.fields), bool)
+    for m in timed.masses:
+        for s, (k, _) in enumerate(m.slots):
+            found[:, k % RATE] |= m.pattern[:, s]
+    return found
+
+
+def _refuse_waves(whole: Traced, rated: np.ndarray) -> None:
+    """ValueError where equations of first order drive one another round, as first-order forms of waves do.
+
+    What damps is an equation of higher order, or one without a rate, that has a part in what goes round.
+    """
+    with uncollected():
+        from scipy.sparse import csr_array
+        from scipy.sparse.csgraph import connected_components
+
+    held = np.zeros((2, *rated.shape), bool)  # of which fields an equation holds anything, and first derivatives
+    for s, (k, b) in enumerate(whole.slots):
+        held[0, :, k] |= whole.pattern[:, s]
+        held[1, :, k] |= whole.pattern[:, s] & (sum(b) == 1)
+    # From an equation to those that move its fields; fields without a rate are found by the equations without one.
+    moved = rated | (~rated.any(axis=0) & ~rated.any(axis=1, keepdims=True) & held[0])
+    drives, slopes = (h.astype(int) @ moved.T.astype(int) > 0 for h in held)
+    round_ = connected_components(csr_array(drives), connection="strong")[1]
+    damps = (np.array(whole.order) > 1) | ~rated.any(axis=1)
+    damped = np.isin(round_, round_[damps])
+    bare = slopes & ~(damped[:, None] | damped) & ~np.eye(len(slopes), dtype=bool)
+    rings = connected_components(csr_array(bare), connection="strong")[1]
+    for one in range(rings.max() + 1):
+        ring = np.flatnonzero(rings == one)
+        if len(ring) > 1:
+            raise ValueError(
+                f"pde: equations {ring.tolist()} are of first order and drive one another, a wave that nothing damps, "
+                "and this method is unstable for it; write it as one equation of second order in time, "
+                "js.dt(u, 2)(x) - c**2 * js.laplacian(u)(x), or add a diffusion of about c spacing / 2 to each"
+            )
 
 
 def _coupled(whole: Any, e: int) -> bool:

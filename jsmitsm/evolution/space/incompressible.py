@@ -4,7 +4,7 @@ An equation div u = 0 determines no rate and no pressure at a moment: a constrai
 system has as many modes as velocities, half of which leave the constraint; what they do is decided by errors of the
 discretization, and from order 5 on some of them grow. So the divergence of the momentum equations takes its place,
 
-    u_t + N(u) + grad p = nu lap u    gives    div(N(u) + grad p) = 0,    with div u = 0 on the walls,
+    u_t + N(u) + grad p = nu lap u    gives    div(N(u) + grad p) = 0,    with div u = 0 on the boundary,
 
 without the viscous terms: what is left of a divergence then diffuses, (div u)_t = nu lap(div u), and dies out (Johnston
 and Liu, J. Comput. Phys. 199, 2004; Shirokoff and Rosales, J. Comput. Phys. 230, 2011). On a plane along which the flow
@@ -139,6 +139,7 @@ def with_pressure_equation(stated: Problem, whole: Traced, flow: Flow, cloud: Cl
 
     def across(u: Any, x: Any, n: Any, p: Any) -> Any:
         """The momentum equations along n where the velocities are zero."""
+
         def still(slot: Any) -> Any:
             k, b = slot
             return jnp.zeros(()) if k >= RATE or k in flow.velocity else partial(u[k], b)(x)
@@ -148,12 +149,19 @@ def with_pressure_equation(stated: Problem, whole: Traced, flow: Flow, cloud: Cl
 
     bcs, loose = dict(stated.bcs), []
     for name, conditions in stated.bcs.items():
-        if name not in cloud.groups or conditions[0].kind in ("periodic", "fix", "free"):
+        if name not in cloud.groups or conditions[0].kind in ("periodic", "fix", "interface"):
             continue
-        # With div u = 0 the system takes one condition for each velocity, without it one more.
+        # Of the flow's conditions, one more than it has velocities, div u = 0 is the last.
         slips = name not in fixed and _slips(conditions, flow, cloud, name)
-        if sum(_rows(c, stated.fields) for c in recorded.bcs[name]) <= dim:
-            bcs[name] = [*conditions, condition(across if slips else continuity)]
+        count = sum(_rows(c, flow, stated.fields) for c in recorded.bcs[name])
+        if count < dim:
+            raise ValueError(
+                f"bcs[{name!r}]: {count} condition(s) on the flow, fields {[*flow.velocity, flow.pressure]}, which "
+                f"takes {dim} beside div u = 0: give all velocities, or the pressure and the velocities along the side"
+            )
+        if count == dim:
+            last = condition(across if slips else continuity)
+            bcs[name] = [*conditions, _outlet(conditions, flow, cloud, name) if name in fixed else last]
         if name not in fixed:
             held = {k for c in conditions if c.kind == "dirichlet" for k in _fields(c, stated.fields)}
             loose += [] if slips or held >= set(flow.velocity) else [name]
@@ -173,18 +181,57 @@ def _fields(c: Condition, fields: int) -> tuple[int, ...]:
     return tuple(range(fields)) if c.field is None else (c.field,)
 
 
-def _rows(c: Condition, fields: int) -> int:
-    """How many numbers a recorded condition gives at a particle."""
-    return c.residual.n_equations if c.kind == "condition" else len(_fields(c, fields))
+def _rows(c: Condition, flow: Flow, fields: int) -> int:
+    """How many numbers a recorded condition gives of the flow alone at a particle."""
+    own = {*flow.velocity, flow.pressure}
+    if c.kind == "free":
+        return 0
+    if c.kind != "condition":
+        return len(own.intersection(_fields(c, fields)))
+    inside = np.array([k in own for k, _ in c.residual.slots], bool)
+    held = c.residual.pattern
+    return int((held[:, inside].any(axis=1) & ~held[:, ~inside].any(axis=1)).sum())
+
+
+def _outlet(conditions: Sequence[Condition], flow: Flow, cloud: Cloud, name: str) -> Condition:
+    """div u = 0 where the pressure is given, and besides it the velocities along a plane across an axis.
+
+    Their slopes are those of their values; modes in the corners grow where they are the solution's own (in 3D), beside
+    slopes that are given, or where the velocity through the plane is held. ValueError where this does not serve.
+    """
+    dim, held = cloud.dim, {c.field: c.parts["value"] for c in conditions if c.kind == "dirichlet"}
+    left = [i for i, k in enumerate(flow.velocity) if k not in held]
+    axis = None if cloud.normals is None else _across(cloud, name)
+    arrays = any(np.ndim(v) for v in held.values() if not callable(v))
+    if axis is None or left != [axis] or (arrays and dim > 2):
+        named = {c.field for c in conditions}
+        bare = next((flow.velocity[i] for i in left if flow.velocity[i] not in named), flow.velocity[left[0]])
+        raise ValueError(
+            f"bcs[{name!r}]: beside the pressure it gives something else than the velocities along a plane across an "
+            f"axis, by numbers or functions, and div u = 0 does not serve as its last condition; give one more, as the "
+            f"slope js.neumann(0.0, field={bare})"
+        )
+
+    def along(u: Any, k: int, i: int, x: Any, p: Any) -> Any:
+        value: Any = held.get(k, 0.0)
+        if callable(value):
+            return jax.jacfwd(lambda y: jnp.asarray(value(y, p), float).reshape(()))(x)[i]
+        return partial(u[k], unit(dim, i))(x) if i == axis or np.ndim(value) else jnp.zeros(())
+
+    return condition(lambda u, x, n, p: total(along(u, k, i, x, p) for i, k in enumerate(flow.velocity)))
+
+
+def _across(cloud: Cloud, name: str) -> int | None:
+    """The axis that a group is a plane across, if it is one."""
+    normals = np.abs(np.asarray(any_number(cloud.normals))[np.asarray(cloud.groups[name])])
+    axis = int(np.argmax(normals[0]))
+    return axis if np.allclose(normals, np.eye(cloud.dim)[axis]) else None
 
 
 def _slips(conditions: Sequence[Condition], flow: Flow, cloud: Cloud, name: str) -> bool:
     """Whether a group is a plane across an axis, with a zero velocity through it and no friction along it."""
-    if cloud.normals is None:
-        return False
-    normals = np.abs(np.asarray(any_number(cloud.normals))[np.asarray(cloud.groups[name])])
-    axis = int(np.argmax(normals[0]))
-    if not np.allclose(normals, np.eye(cloud.dim)[axis]):
+    axis = None if cloud.normals is None else _across(cloud, name)
+    if axis is None:
         return False
     found = {c.field: (c.kind, c.parts.get("value")) for c in conditions}
     return all(
