@@ -3,7 +3,7 @@
 Between a facet of the outermost simplices and a curved boundary lies a thin layer, swept along the particles' normals,
 interpolated, so that neighbouring layers fit together; it ends on the boundary. That is the zero level of the shape
 where the cloud knows it, else the graph, over the plane of the facet, of the polynomial through the boundary particles
-around it.
+around it. Facets that reach across an edge of a known solid are for ``integrals.edges``.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from jsmitsm.cloud.integrals.swept import Swept, simplex_rule
 from jsmitsm.cloud.triangulation import boundary_facets, lying_on, normals_of, simplices
 from jsmitsm.taylor.multi_indices import multi_indices
 
-# Points (Q, D), their normals (Q, D), and whether most corners of their facet are of a group: which of them (Q,) are it.
+# Which points (Q, D) belong to a group, by their normals (Q, D) and whether (Q,) most corners of their facet do.
 Members = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 _STEPS = 8
 # Heights over a facet, in sizes of its surroundings, and differences of normals, that are round-off.
@@ -54,10 +54,11 @@ def surface_rule(
     # Facets of another part may reach across an edge to this one.
     some = np.flatnonzero(own | near)
     found = []
-    for swept, which in _swept(cloud, facets[some], normal[some], ways[some], near[some], degree):
+    for swept, which in _swept(cloud, facets[some], normal[some], ways[some], degree):
         at, volume = swept.at(1.0)
         # A layer that ends at the surface is as thick as the way's part along the normal.
-        weights = volume / np.maximum(np.einsum("mqd,mqd->mq", swept.way, swept.outward), _GRAZING)
+        steep = np.einsum("mqd,mqd->mq", swept.way, swept.outward)
+        weights = volume / np.copysign(np.maximum(np.abs(steep), _GRAZING), steep)
         apart = at.shape[1] == 1  # their points may lie on different sides of an edge
         mine = members(at[:, 0], swept.outward[:, 0], most[some[which]]) if apart else own[some[which]]
         found.append([x[mine].reshape(-1, *x.shape[2:]) for x in (at, weights, swept.outward)])
@@ -71,7 +72,7 @@ def _layers(cloud: Cloud, degree: int) -> tuple[np.ndarray, np.ndarray]:
     some = np.flatnonzero(near | ~lying_on(cloud, facets))
     found, measure = [np.zeros((0, cloud.dim))], [np.zeros(0)]
     x, w = np.polynomial.legendre.leggauss(degree // 2 + 1)
-    for swept, _ in _swept(cloud, facets[some], normal[some], ways[some], near[some], degree):
+    for swept, _ in _swept(cloud, facets[some], normal[some], ways[some], degree):
         for share, part in zip((x + 1.0) / 2.0, w / 2.0):
             here, volume = swept.at(share)
             found.append(here.reshape(-1, cloud.dim))
@@ -80,7 +81,7 @@ def _layers(cloud: Cloud, degree: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _ways(cloud: Cloud, facets: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The ways (M, D, D) from the corners of all facets (M, D), and which (M,) come near an edge that the shape tells."""
+    """The ways (M, D, D) from the corners of all facets (M, D), and which (M,) come near an edge of a known shape."""
     own = normals_of(cloud)
     if cloud._shape is not None and cloud.dim == 3:
         return open_ways(np.asarray(cloud.points, float), facets, normal, own)
@@ -90,12 +91,29 @@ def _ways(cloud: Cloud, facets: np.ndarray, normal: np.ndarray) -> tuple[np.ndar
 
 
 def _swept(
-    cloud: Cloud, facets: np.ndarray, normal: np.ndarray, ways: np.ndarray, near: np.ndarray, degree: int
+    cloud: Cloud, facets: np.ndarray, normal: np.ndarray, ways: np.ndarray, degree: int
 ) -> list[tuple[Swept, np.ndarray]]:
     """The ways from facets (M, D) with outward normals (M, D) to the boundary, and which facets they are from.
 
-    Facets near an edge over which it is not smooth come last, a point a row.
+    Where it is not smooth over facets of a solid whose shape is known, they come last, a point a row.
     """
+    if cloud._shape is None or cloud.dim < 3:
+        return [(_over_sides(cloud, facets, normal, ways, degree)[0], np.arange(len(facets)))]
+    own = (np.einsum("mkd,md->mk", normals_of(cloud)[facets], normal) >= SMOOTH).all(axis=1)
+    some = np.flatnonzero(own)
+    swept, good = _over_sides(cloud, facets[some], normal[some], ways[some], degree)
+    good &= (np.einsum("mqd,mrd->mqr", swept.outward, swept.outward) >= SMOOTH).all(axis=(1, 2))
+    kept = Swept(*(x if x is swept.weights else x[good] for x in swept))
+    rest = np.concatenate([np.flatnonzero(~own), some[~good]])
+    corners = np.asarray(cloud.points, float)[facets[rest]]
+    parted, of = over_edges(cloud._shape, corners, ways[rest], normal[rest], degree)
+    return [(kept, some[good]), (parted, rest[of])]
+
+
+def _over_sides(
+    cloud: Cloud, facets: np.ndarray, normal: np.ndarray, ways: np.ndarray, degree: int
+) -> tuple[Swept, np.ndarray]:
+    """The ways to a boundary that is smooth over each facet, and over which facets (M,) it was found so."""
     corners = np.asarray(cloud.points, float)[facets]
     # An even number: the middle of a side is as near to one particle as to the other, whose polynomials differ there.
     at, weights = simplex_rule(cloud.dim - 1, 2 * (degree // 4 + 1))
@@ -110,15 +128,7 @@ def _swept(
     reach, outward = np.where(sane[:, None], reach, 0.0), np.where(sane[:, None, None], outward, normal[:, None])
     sides, turns = (x[:, 1:] - x[:, :1] for x in (corners, ways))
     handed = np.sign(np.linalg.det(np.concatenate([sides, normal[:, None]], axis=1)))
-    swept = Swept(base, way, reach, weights, sides, turns, handed[:, None], outward)
-    if cloud._shape is None or cloud.dim < 3:
-        return [(swept, np.arange(len(facets)))]
-    own = np.einsum("mkd,md->mk", normals_of(cloud)[facets], normal) >= SMOOTH
-    smooth = own.all(axis=1) & sane & good & (np.einsum("mqd,mrd->mqr", outward, outward) >= SMOOTH).all(axis=(1, 2))
-    rest = np.flatnonzero(~smooth)
-    kept = Swept(*(x if x is weights else x[smooth] for x in swept))
-    parted, of = over_edges(cloud._shape, corners[rest], ways[rest], normal[rest], degree)
-    return [(kept, np.flatnonzero(smooth)), (parted, rest[of])]
+    return Swept(base, way, reach, weights, sides, turns, handed[:, None], outward), good & sane
 
 
 def _graphs(cloud: Cloud, corners: np.ndarray, facets: np.ndarray, normal: np.ndarray, degree: int):
@@ -167,9 +177,11 @@ def _graphs(cloud: Cloud, corners: np.ndarray, facets: np.ndarray, normal: np.nd
 def _to_shape(
     cloud: Cloud, base: np.ndarray, way: np.ndarray, normal: np.ndarray, reach: np.ndarray, outward: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """How far it is to the boundary, its normals, and for which facets (M,) this is what the shape says, where the cloud
-    knows it: the graph came close."""
-    if cloud._shape is None:
+    """How far it is to the boundary, and its normals, by the shape where the cloud knows it: the graph came close.
+
+    Also for which facets (M,) it did; for all where no shape is known.
+    """
+    if cloud._shape is None or not len(base):
         return reach, outward, np.ones(len(base), bool)
 
     def off(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

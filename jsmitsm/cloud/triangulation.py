@@ -57,21 +57,43 @@ def boundary_facets(cloud: Cloud) -> tuple[np.ndarray, np.ndarray]:
     normal = _across(points[facets])
     size = np.linalg.norm(normal, axis=2)
     inside = ~_outside(cloud, points, cells)
-    flat, outer = ~_solid(points, cells), np.zeros(size.shape, bool)
+    thin, outer = ~_solid(points, cells), np.zeros(size.shape, bool)
     while True:
         outer = inside[:, None] & ((beside < 0) | ~inside[beside])
         # Flat simplices within the domain count, or their neighbours' facets would face nothing. Those on its boundary
         # do not: over a notch they would be a skin with nothing behind it.
-        skin = inside & flat & (np.where(outer, size, 0.0).sum(axis=1) > 0.49 * size.sum(axis=1))
-        if not skin.any():
+        flat = np.flatnonzero(inside & thin)
+        skin = flat[_bare(flat, beside, size, outer)]
+        if not len(skin):
             break
-        inside &= ~skin
+        inside[skin] = False
     # Particles on one line make facets without area, which face nowhere.
     outer &= size > 1e-9 * np.ptp(points[facets], axis=2).max(axis=2) ** (cloud.dim - 1)
     normal = normal[outer] / size[outer][:, None]
     own, opposite = np.nonzero(outer)
     inward = points[cells[own, opposite]] - points[facets[outer][:, 0]]
     return facets[outer], -np.copysign(1.0, np.einsum("md,md->m", inward, normal))[:, None] * normal
+
+
+def _bare(flat: np.ndarray, beside: np.ndarray, size: np.ndarray, outer: np.ndarray) -> np.ndarray:
+    """Mask of the flat simplices half of whose facets, or more, are outer ones; if of none, heaps of them together."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    free = np.where(outer[flat], size[flat], 0.0).sum(axis=1)
+    found = free > 0.49 * size[flat].sum(axis=1)
+    if found.any() or not free.any():
+        return found
+    place = np.full(len(size), -1)
+    place[flat] = np.arange(len(flat))
+    other = np.where(beside[flat] < 0, -1, place[beside[flat]])
+    touching = (other >= 0) & (size[flat] > 1e-9 * size.max())
+    one, k = np.nonzero(touching)
+    graph = coo_matrix((np.ones(len(one), bool), (one, other[one, k])), shape=(len(flat), len(flat)))
+    heap = connected_components(graph, directed=False)[1]
+    behind = np.where(outer[flat] | touching, 0.0, size[flat]).sum(axis=1)
+    free, behind = (np.bincount(heap, weights=x)[heap] for x in (free, behind))
+    return (free > 0.98 * behind) & (free > 0.0)
 
 
 def _across(at: np.ndarray) -> np.ndarray:

@@ -25,7 +25,9 @@ _SPOTS = np.array([[2, 0, 0], [0, 2, 0], [0, 0, 2], [0, 1, 1], [1, 0, 1], [1, 1,
 _QUARTERS = _SPOTS[[[0, 5, 4], [5, 1, 3], [4, 3, 2], [3, 4, 5]]]
 
 
-def open_ways(points: np.ndarray, facets: np.ndarray, normal: np.ndarray, own: np.ndarray) -> tuple[Any, Any]:
+def open_ways(
+    points: np.ndarray, facets: np.ndarray, normal: np.ndarray, own: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """The ways (M, 3, 3) from the corners of all facets (M, 3) of a solid, and which facets (M,) come near an edge.
 
     A particle has one way in all its facets, or their layers would overlap, or gape: its normal ``own`` (N, 3), and
@@ -33,8 +35,7 @@ def open_ways(points: np.ndarray, facets: np.ndarray, normal: np.ndarray, own: n
     their angles.
     """
     across = (np.einsum("mkd,md->mk", own[facets], normal) < SMOOTH).any(axis=1)
-    at = np.zeros(len(points), bool)
-    at[facets[across]] = True
+    at = np.isin(np.arange(len(points)), facets[across])
     total = np.zeros(points.shape)
     for k in range(3):
         here, one, other = (points[facets[:, (k + i) % 3]] for i in range(3))
@@ -54,27 +55,34 @@ def over_edges(
     A triangle that an edge parts into one corner and two is summed along rays from that corner, either side of the
     edge by itself: then the sums converge as fast as on smooth sides. Others are quartered.
     """
-    rays = _Rays(shape, corners, ways, normal)
-    facet, part, found = np.arange(len(corners)), np.broadcast_to(np.eye(3), corners.shape), []
+    rays, found = _Rays(shape, corners, ways, normal), []
+    facet, part = np.arange(len(corners)), np.broadcast_to(np.eye(3), corners.shape)
     for level in range(_LEVELS + 1):
         count = max(3, 2 * (degree // 4 + 1) - level)
         spots = np.einsum("sk,tkc->tsc", _SPOTS, part)
         _, outward, there = rays.ends(np.repeat(facet, 6), spots.reshape(-1, 3))
-        outward, there = outward.reshape(-1, 6, 3), there.reshape(-1, 6).all(axis=1)
+        outward, there = outward.reshape(-1, 6, 3), np.asarray(there.reshape(-1, 6).all(axis=1))
         alike = np.einsum("tsd,trd->tsr", outward, outward) >= SMOOTH
         lone = np.stack([_alone(alike, k) for k in range(3)], axis=1) & there[:, None]
-        parted, whole = lone.any(axis=1), alike.all(axis=(1, 2)) & there
-        if level == _LEVELS:
-            whole = ~parted
-        first = np.where(parted, lone.argmax(axis=1), 0)[:, None]
-        found.append((*_plain(facet[whole], part[whole], count), 4.0**-level))
-        turned = np.take_along_axis(part, ((first + np.arange(3)) % 3)[..., None], axis=1)
-        found.append((*_parted(rays, facet[parted], turned[parted], count), 4.0**-level))
+        parted = np.asarray(lone.any(axis=1))
+        whole = np.asarray(there & alike.all(axis=(1, 2))) if level < _LEVELS else ~parted
         left = ~(whole | parted)
+        turn = (np.where(parted, lone.argmax(axis=1), 0)[:, None] + np.arange(3)) % 3
+        part, outward = (np.take_along_axis(x, turn[..., None], axis=1) for x in (part, outward[:, :3]))
+        for which, (owner, at, weights), sides in (
+            (whole, _plain(facet[whole], part[whole], count), outward[whole, :1]),
+            (parted, _parted(rays, facet[parted], part[parted], count), np.tile(outward[parted, :2], (1, count, 1))),
+        ):
+            # The rule holds if its points see what the corners do: an edge may bend into a triangle between them.
+            pieces = len(sides), sides.shape[1], len(at) // max(len(sides) * sides.shape[1], 1), 3
+            seen = rays.ends(owner, at)[1].reshape(pieces)
+            good = (np.einsum("tsqd,tsd->tsq", seen, sides) >= SMOOTH).all(axis=(1, 2)) | (level == _LEVELS)
+            left[np.flatnonzero(which)[~good]] = True
+            keep = np.repeat(good, len(owner) // max(len(good), 1))
+            found.append((owner[keep], at[keep], weights[keep] * 4.0**-level))
         facet = np.repeat(facet[left], 4)
         part = np.einsum("qsk,tkc->tqsc", _QUARTERS, part[left]).reshape(-1, 3, 3)
-    facet, at = (np.concatenate([piece[k] for piece in found]) for k in (0, 1))
-    weights = np.concatenate([piece[2] * piece[3] for piece in found])
+    facet, at, weights = (np.concatenate(pieces) for pieces in zip(*found))
     reach, outward, _ = rays.ends(facet, at)
     base, way = rays.starts(facet, at)
     sides, turns = (x[:, 1:] - x[:, :1] for x in (corners, ways))
