@@ -470,9 +470,8 @@ def test_a_steep_layer_of_a_nonlinear_equation():
     """u'' = k^2 sinh u, where the solution on the first cloud is no start for the next: the user's own is."""
     k, held = 30.0, 6.0
     exact = lambda x: 4 * jnp.arctanh(jnp.tanh(held / 4) * jnp.exp(-k * x[0]))
-    problem = js.Problem(
-        lambda u, x: js.laplacian(u)(x) - k**2 * jnp.sinh(u(x)), {"left": js.dirichlet(held), "right": js.dirichlet(exact)}
-    )
+    ends_held = {"left": js.dirichlet(held), "right": js.dirichlet(exact)}
+    problem = js.Problem(lambda u, x: js.laplacian(u)(x) - k**2 * jnp.sinh(u(x)), ends_held)
     slope = -2 * k * np.sinh(held / 2)
     found = js.adapt(problem, line, 1e-6, quantity=lambda sol: sol.flux("left"))
     assert found.reached and abs(found.quantity / -slope - 1) < 1e-6
