@@ -137,6 +137,32 @@ def test_orders_of_reactions(scheme, second):
     assert few < 3e-3 and np.log2(few / many) / 2 > 3.6
 
 
+def test_nothing_nonlinear_is_left_of_a_cube_at_rest():
+    """Newton's method begins with a matrix in which u^3 has no entry."""
+    problem = js.Problem(
+        lambda u, x, t: js.dt(u)(x) - js.laplacian(u)(x) + u(x) ** 3 - jnp.pi**2 * jnp.sin(jnp.pi * x[0]),
+        everywhere(ROD, js.dirichlet(0.0)),
+    )
+    found = [js.evolve(problem, ROD, 0.0, t=(0.0, 0.2), steps=40, scheme=s).u[-1] for s in ("imex", "esdirk")]
+    assert np.abs(found[0]).max() > 0.5 and np.abs(found[0] - found[1]).max() < 1e-7
+
+
+PULSE = lambda t: jnp.exp(-(((t - 0.5) / 0.03) ** 2))  # noqa: E731
+
+
+@pytest.mark.parametrize("held", [False, True])
+def test_a_smooth_pulse_from_rest(held):
+    """Before it begins nothing is there, whose digits nobody wants: thousands of steps were made for them."""
+    source = 0.0 if held else 1.0
+    problem = js.Problem(
+        lambda u, x, t: js.dt(u)(x) - js.laplacian(u)(x) - source * PULSE(t) * jnp.sin(jnp.pi * x[0]),
+        {"left": js.dirichlet(lambda x, t: (1.0 - source) * PULSE(t)), "right": js.dirichlet(0.0)},
+    )
+    found = js.evolve(problem, ROD, 0.0, t=(0.0, 1.0), tol=1e-6, order=6)
+    exact = js.evolve(problem, ROD, 0.0, t=(0.0, 1.0), steps=1000, order=6)
+    assert found.stats["steps"] < 300 and np.abs(found.u[-1] - exact.u[-1]).max() < 1e-6
+
+
 @pytest.mark.parametrize("scheme", ["imex", "esdirk"])
 def test_a_travelling_front(scheme):
     cloud = js.interval(0.0, 1.0, 31)

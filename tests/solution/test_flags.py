@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import jsmitsm as js
+from jsmitsm.solution import flags
 
 SIDES = ("left", "right", "bottom", "top")
 smooth = lambda x: jnp.sin(2 * x[0]) * jnp.exp(x[1])
@@ -196,3 +197,16 @@ def test_coordinates_that_float32_cannot_hold():
             held = {"left": js.dirichlet(0.0), "right": js.dirichlet(1.0)}
             sol = js.solve(js.Problem(lambda u, x: js.laplacian(u)(x) - 1.0, held), line)
             assert told == any("known to" in flag for flag in sol.flags)
+
+
+def test_an_estimate_that_is_there_clears_a_large_cloud_as_well(monkeypatch):
+    """Nobody is asked for one beyond so many particles; one that is known is looked at."""
+    exact = lambda x: jnp.sin(9 * x[0]) * jnp.exp(x[1])
+    problem = posed(laplace, exact)
+    monkeypatch.setattr(flags, "MANY", 100)
+    monkeypatch.setattr(flags, "CLEAR", dict.fromkeys(flags.CLEAR, 0.0))
+    doubt = lambda run, values, nums, out, found: out.append("Who knows?")
+    monkeypatch.setattr(flags, "DOUBTS", (*flags.DOUBTS, doubt))
+    sol, known = (js.solve(problem, js.rectangle((0, 0), (1, 1), (21, 21))) for _ in range(2))
+    known.error_estimate()
+    assert [f[:10] for f in sol.flags] == ["Who knows?"] and known.flags == []
