@@ -11,15 +11,53 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm.discretization.layout import Discretization
-from jsmitsm.particle.polynomials import derivative_table
+from jsmitsm.particle.polynomials import derivative_table, monomials_on_host
 from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.runtime.whole_program import in_one_program
 from jsmitsm.taylor.multi_indices import index_of, multi_indices
+
+# A polynomial that misses the nearest values by so many times what these differ knows nothing of them.
+_ASTRAY = 3.0
+# Singular values below this part of the largest say nothing.
+_RANK = 1e-6
 
 
 def held_particles(disc: Discretization) -> np.ndarray:
     """The particles all of whose values are held, but for those that take them from a periodic partner."""
     return np.flatnonzero(disc.held.all(axis=1) & (disc.partner == np.arange(len(disc.cloud))))
+
+
+def without_astray(disc: Discretization, taylor: Any, values: Any) -> Any:
+    """Expansions (N, F, K) of the values (N, F), with quadratic fits for those of held particles that miss what they
+    were made of.
+
+    The particles in a tip thinner than the spacing all but stand on a line. What their polynomials do across it is
+    round-off, and nothing asks for it but who looks there.
+    """
+    ids = held_particles(disc)
+    if is_traced(taylor, values, disc.points) or not len(ids):
+        return taylor
+    points, known = np.asarray(disc.points, float), np.asarray(disc.images.extend_values(values), float)
+    near = np.asarray(disc.stencils.indices)[ids]
+    near = np.where(near >= 0, near, ids[:, None])
+    nearest = near[:, 1 : 1 + 2 * disc.rec.dim]
+    offset = points[nearest] - points[ids][:, None]
+    powers = monomials_on_host(offset.reshape(-1, disc.rec.dim).T, disc.rec.reach).T.reshape(*nearest.shape, -1)
+    off = np.einsum("nkt,nft->nkf", powers, np.asarray(taylor)[ids]) - known[nearest]
+    change = known[nearest] - known[ids][:, None]
+    away = nearest != ids[:, None]
+    astray = (np.abs(off * away[..., None]).max(axis=1) > _ASTRAY * np.abs(change).max(axis=1)).any(axis=1)
+    out = np.array(taylor) if astray.any() else taylor
+    degree = min(2, disc.rec.reach)
+    for i, around in zip(ids[astray], near[astray]):
+        scale = np.abs(points[around] - points[i]).max()
+        way = (points[around] - points[i]) / scale
+        terms = monomials_on_host(way.T, degree).T
+        found = np.linalg.lstsq(terms[:, 1:], known[around] - known[i], rcond=_RANK)[0]
+        degrees = np.array([sum(a) for a in multi_indices(disc.rec.dim, degree)])[1:]
+        out[i] = 0.0
+        out[i, :, 0], out[i, :, 1 : len(terms[0])] = known[i], (found / scale ** degrees[:, None]).T
+    return out
 
 
 def with_held_expansions(disc: Discretization, taylor: Any) -> Any:

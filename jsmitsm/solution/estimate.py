@@ -89,9 +89,8 @@ class Correction:
 def correction(fit: Fit, values: Any, made: Run | None = None) -> Correction:
     """The estimated error of the values (N, F), and what it comes from.
 
-    made: the run of the solve, where its numbers and rows are still there.
-
-    The defect of the solution in rows of order p + 2, taken through the inverse of their matrix,
+    made: the run of the solve, where its numbers and rows are still there. The defect of the solution
+    in rows of order p + 2, taken through the inverse of their matrix,
 
         e = A_{p+2}^-1 (b_{p+2} - A_{p+2} u_p),
 
@@ -111,12 +110,13 @@ def correction(fit: Fit, values: Any, made: Run | None = None) -> Correction:
     if fit.recipe.formulation == "lsq" or fit.recipe.method != "S":
         return _against(fit, low, values, nums)
     order = _beside(fit, low)
-    high, high_nums = _of_order(fit, low, order)
-    above = Run(high, fit.problem, "auto", True, True, "loo")
     try:
+        high, high_nums = _of_order(fit, low, order)
+        above = Run(high, fit.problem, "auto", True, True, "loo")
         high_rows = above.local_rows(high_nums)
-    except SolveError:  # too few neighbours for so high an order
-        if (below := _below(fit, low, values)) is None:
+    except (SolveError, ValueError) as fault:  # too few neighbours for so high an order
+        few = isinstance(fault, SolveError) or str(fault).startswith("cloud:")
+        if not few or (below := _below(fit, low, values)) is None:
             raise
         return Correction(below[0], below[0], None, None, below[1])
     entries = matrix(high, *high_rows)

@@ -11,7 +11,7 @@ import numpy as np
 
 from jsmitsm.cloud.neighbours import Stencils
 from jsmitsm.discretization.coefficients import numbers
-from jsmitsm.discretization.held_particles import held_particles
+from jsmitsm.discretization.held_particles import held_particles, without_astray
 from jsmitsm.discretization.layout import Discretization, discretize, sorted_classes
 from jsmitsm.discretization.rows import all_coefficients
 from jsmitsm.runtime.progress import bar
@@ -63,14 +63,15 @@ class Fit:
         disc, taylor = self.discretization(), self.taylor
         held = held_particles(disc)
         if known is not None:
-            found = self._fitted(disc, held, taylor, values) if len(held) else known
+            found = without_astray(disc, self._fitted(disc, held, taylor, values), values) if len(held) else known
             return np.where(np.isin(disc.partner, held)[:, None, None], found, known)
         if taylor is not None and len(held):
             # Those of held particles are continued from others; fitted where that is linearised they are their own.
             fitted = self._fitted(disc, held, taylor, values if about is None else about)
             alone = np.isin(disc.partner, held)[:, None, None]
             taylor = (jnp if is_traced(fitted, taylor) else np).where(alone, fitted, taylor)
-        return self._fitted(disc, np.flatnonzero(disc.partner == np.arange(len(self.cloud))), taylor, values)
+        found = self._fitted(disc, np.flatnonzero(disc.partner == np.arange(len(self.cloud))), taylor, values)
+        return without_astray(disc, found, values)
 
     def _fitted(self, disc: Discretization, ids: np.ndarray, taylor: Any, values: Any) -> Any:
         """Taylor coefficients (N, F, K) of the particles ``ids`` alone, linearised at ``taylor``."""

@@ -225,3 +225,14 @@ def test_a_cut_thinner_than_the_spacing():
     points = np.random.default_rng(0).uniform((0.55, 0.4), (1.95, 0.6), (4000, 2))
     values, cut = np.asarray(sol(points)), np.abs(points[:, 1] - 0.5) < half
     assert np.abs(values - np.asarray(jax.vmap(exact)(points)))[~cut].max() < 1e-3
+
+
+def test_a_needle_thinner_than_the_spacing():
+    """Its particles all but stand on a line, and little is known across it: slopes were 4,000, and are 1."""
+    tip = [(0, 0), (0.99, 0), (1, -0.6), (1.01, 0), (2, 0), (2, 1), (0, 1)]
+    cloud = js.from_polygon(tip, 0.05)
+    exact = lambda x: 1 + x[0] + 0.5 * x[1]
+    sol = js.solve(js.Problem(lambda u, x: js.laplacian(u)(x), {"boundary": js.dirichlet(exact)}), cloud)
+    points = np.stack([np.full(20, 1.0), np.linspace(-0.55, -0.01, 20)], axis=1)
+    np.testing.assert_allclose(sol(points), jax.vmap(exact)(points), atol=0.15)
+    assert np.abs(sol.grad(points)).max() < 20.0 and sol.error_estimate().max() < 1e-10
