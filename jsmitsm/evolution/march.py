@@ -25,8 +25,9 @@ HISTORY = 2**29
 BLOWN = 1e30
 # An estimated error, in time or in all, above this part of the solution is a flag.
 LARGE = 0.02
-# A start of less than this part of what data make in one of so many parts of a run is one at rest.
-_REST, _PARTS = 1e-6, 64
+# A start of less than this part of what data make in one of so many parts of a run is one at rest. No step is longer
+# then than such a part, or it would step over what the data do between: 2^-6 of the run.
+_REST, _PARTS, _SEEN = 1e-6, 64, 6
 # Of the schemes, as ``stats`` tells them.
 NAMES = {
     "esdirk": "KenCarp4", "imex": "KenCarp4, implicit and explicit", "radau": "Radau IIA 5", "euler": "backward Euler",
@@ -182,7 +183,7 @@ def _adaptive(run: Run, y: np.ndarray, t0: float, t1: float, tol: float, history
     least = foreseen if run.semi.system.largest(y) < _REST * foreseen else 0.0
     counts = controlled(
         stepper, y, t0, t1, tol, added, tell,
-        lambda error: _size(run, error, max(history.scale, least)),
+        lambda error: _size(run, error, max(history.scale, least)), _SEEN if least else 0,
     )  # fmt: skip
     run.counts.update(counts)
 

@@ -32,6 +32,8 @@ SINGULAR = 1e15  # condition number (scaled) above which no digit of a solution 
 MULTIGRID = ("amg", "device amg")
 # Unknowns from which a factorisation may take seconds: a thread costs less than a millisecond.
 LONG = 10_000
+# Right-hand sides below this lose digits as they vanish; they are lifted by this power of two.
+_HARDLY, _LIFT = 1e-250, 2.0**600
 COUNTS = {"factorisations": 0}
 
 
@@ -141,10 +143,12 @@ class Factor:
         before, after = self.row_scale, self.col_scale
         if transpose:
             before, after = after, before
-        rhs = before[:, None] * wide
+        # Of what is hardly a number any more no residual is small: it is solved for as a multiple of itself.
+        lift = np.where(np.abs(wide).max(axis=0, initial=0.0) < _HARDLY, _LIFT, 1.0)
+        rhs = before[:, None] * (lift * wide)
         with self._lock:
             x = self._solve_scaled(rhs, transpose)
-        x *= after[:, None]
+        x *= after[:, None] / lift
         x[:, ~finite] = np.nan
         self.info["seconds"]["solve"] = time.perf_counter() - started
         return x.reshape(b.shape)

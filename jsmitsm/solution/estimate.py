@@ -103,7 +103,6 @@ def correction(fit: Fit, values: Any, made: Run | None = None) -> Correction:
     of order p + 2 (see ``_by_misfits``). Held values have no error; where p + 2 is no better the estimate says little.
     """
     low = fit.discretization()
-
     known = None if made is None else made.nums
     nums = cache(lambda: numbers(low, fit.problem, fit.taylor) if known is None else known)
 
@@ -151,8 +150,9 @@ def correction(fit: Fit, values: Any, made: Run | None = None) -> Correction:
     except SolveError:  # as on few particles
         below = _below(fit, low, values)
         error = towards = through(defect()) if below is None else below[0]
-    if order > fit.recipe.order >= HIGH and not is_traced(error, trust) and trust.min(initial=1.0) < TRUSTED:
-        error = _doubted(fit, low, values, error)
+    if order > fit.recipe.order and not is_traced(error, trust) and trust.min(initial=1.0) < TRUSTED:
+        if fit.recipe.order >= HIGH or share(np.asarray(error), np.asarray(values)) > 1.0:
+            error = _doubted(fit, low, values, error)
     turned = partial(through, transpose=True)
     return Correction(error, towards, defect, turned, comparable(high, high_nums), through, between)
 

@@ -150,6 +150,27 @@ def test_nothing_nonlinear_is_left_of_a_cube_at_rest():
 PULSE = lambda t: jnp.exp(-(((t - 0.5) / 0.03) ** 2))  # noqa: E731
 
 
+def test_a_run_has_no_derivative_forward():
+    def last(s):
+        p = {"k": 0.3, "s": s, "b": 0.5, "a": 0.4}
+        return jnp.sum(js.evolve(reacting(p), ROD, 0.5, t=(0.0, 0.5), steps=2, order=2, scheme="imex").u[-1])
+
+    with pytest.raises(ValueError, match="jax.grad, jax.vjp"):
+        jax.jvp(last, (jnp.asarray(0.3),), (jnp.asarray(1.0),))
+
+
+@pytest.mark.parametrize("scheme", ["imex", "esdirk"])
+def test_sources_that_vanish_digit_by_digit(scheme):
+    """Far from its middle a pulse is hardly a number any more; no residual is small then."""
+    problem = js.Problem(
+        lambda u, x, t: js.dt(u)(x) - 0.1 * js.laplacian(u)(x) + u(x) ** 2
+        - jnp.exp(-(((t - 0.7) / 0.02) ** 2)) * jnp.sin(3 * x[0]),
+        everywhere(ROD, js.dirichlet(0.0)),
+    )  # fmt: skip
+    found = [js.evolve(problem, ROD, 0.0, t=(0.0, 1.0), steps=n, scheme=scheme).u[-1].max() for n in (50, 100, 200)]
+    assert found[0] > 0.02 and max(found) - min(found) < 1e-4
+
+
 @pytest.mark.parametrize("held", [False, True])
 def test_a_smooth_pulse_from_rest(held):
     """Before it begins nothing is there, whose digits nobody wants: thousands of steps were made for them."""

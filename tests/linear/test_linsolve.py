@@ -287,6 +287,13 @@ def test_order_is_found_once_for_one_pattern(monkeypatch):
     solve(2 * data, rows, cols, np.ones(324), n=324, points=points)
 
 
+def test_what_is_hardly_a_number_is_solved_for():
+    data, rows, cols, points = grid(18)
+    b = np.sin(np.arange(324.0))
+    whole, little = (solve(data, rows, cols, size * b, n=324, points=points) for size in (1.0, 1e-310))
+    assert np.abs(little * 2.0**600 / (1e-310 * 2.0**600) - whole).max() < 1e-10 * np.abs(whole).max()
+
+
 def test_cache_is_bounded(monkeypatch):
     monkeypatch.setattr(factor_cache, "CACHE_ENTRIES", 2)
     index = np.arange(3)

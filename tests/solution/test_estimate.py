@@ -110,3 +110,16 @@ def test_few_particles_whose_higher_order_is_singular(seed):
     sol = js.solve(problem, cloud, order=6)
     error = np.abs(sol.u - np.asarray(jax.vmap(exact)(cloud.points))).max()
     assert 0.5 * error < sol.error_estimate().max() < 10 * error
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_four_by_four_particles_of_order_four(seed):
+    exact = lambda x: jnp.sin(3 * x[0]) * jnp.cos(2 * x[1])
+    problem = js.Problem(
+        lambda u, x: js.laplacian(u)(x) - js.laplacian(exact)(x),
+        dict.fromkeys(("left", "right", "bottom", "top"), js.dirichlet(exact)),
+    )
+    cloud = js.rectangle((0, 0), (1, 1), (4, 4), jitter=0.2, seed=seed)
+    sol = js.solve(problem, cloud)
+    error = np.abs(sol.u - np.asarray(jax.vmap(exact)(cloud.points))).max()
+    assert 0.5 * error < sol.error_estimate().max() < 50 * error

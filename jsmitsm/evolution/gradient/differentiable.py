@@ -38,7 +38,7 @@ def differentiable(run: Run, steps: int, parts: np.ndarray) -> Evolution:
         renewed = drifted if semi.reference is not None else None
         newton = not semi.linear and run.name != "imex"
         plan = Plan(semi, scheme, newton, steps - done, is_traced(run.t), run.throw, renewed, fresh)
-        out = states(plan, given)
+        out = _stepped(plan, given)
         made = len(out) - 1
         found.append(out if not found else out[1:])
         known.append([v if done + made == steps else v[:, : made * m] for v in (samples[0], *samples[3:4])])
@@ -52,6 +52,18 @@ def differentiable(run: Run, steps: int, parts: np.ndarray) -> Evolution:
     good = finite if is_traced(finite) else bool(finite)
     stats = {"scheme": "Radau IIA 5" if isinstance(scheme, Radau) else scheme.name, "steps": steps}
     return Evolution(t0 + (t1 - t0) * parts, u, rates, run.cloud, recipe, good, stats)
+
+
+def _stepped(plan: Plan, given: Inputs) -> Any:
+    try:
+        return states(plan, given)
+    except TypeError as error:
+        if "forward-mode" not in str(error):
+            raise
+        raise ValueError(
+            "js.evolve: a run has derivatives backward alone, and jax.jvp, jax.jacfwd and jax.hessian ask for those "
+            "forward; use jax.grad, jax.vjp or jax.jacrev"
+        ) from None
 
 
 def _inputs(

@@ -17,11 +17,12 @@ _SAFETY = 0.8
 
 def controlled(
     stepper: Any, y: np.ndarray, t0: float, t1: float, tol: float, keep: Callable[[float, Step], None],
-    tell: Callable[[float], None], size: Callable[[np.ndarray], float], rungs: tuple[int, int] | None = None,
+    tell: Callable[[float], None], size: Callable[[np.ndarray], float], coarsest: int = 0,
 ) -> dict[str, int]:  # fmt: skip
     """Steps of (t1 - t0) / 2^k, k changing where the estimate asks for it; a step begins at a multiple of its size.
 
-    size: the norm of an error relative to the solution. Raises Stopped where the smallest step does not do.
+    size: the norm of an error relative to the solution. coarsest: the least k. Raises Stopped where the smallest step
+    does not do.
     """
     whole = t1 - t0
     step = stepper.first(y, t0)
@@ -52,7 +53,7 @@ def controlled(
         # The end, to the last digit.
         keep(t1 if place == 2**level else t0 + whole * place / 2**level, step)
         tell(place / 2**level)
-        while level and place % 2 == 0 and (2.0 ** (1.0 / power)) * error < _SAFETY**4 and place < 2**level:
+        while level > coarsest and place % 2 == 0 and (2.0 ** (1.0 / power)) * error < _SAFETY**4 and place < 2**level:
             level, place = level - 1, place // 2
             error *= 2.0 ** (1.0 / power)
     return counts
