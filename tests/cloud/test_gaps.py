@@ -125,3 +125,22 @@ def test_both_sides_of_a_slit_have_their_particles():
     problem = js.Problem(lambda u, x: js.laplacian(u)(x), {"boundary": js.dirichlet(lambda x: x[0] * x[1])})
     right = np.prod(np.asarray(cloud.points), axis=1)
     np.testing.assert_allclose(js.solve(problem, cloud, order=4).u, right, rtol=0, atol=1e-12)  # exact, to round-off
+
+
+@pytest.mark.parametrize("width", [1e-2, 5e-4, 1e-5])
+def test_a_wedge_that_closes(width):
+    """Particles on its two sides are beside each other, a thousandth of their distance in front."""
+    vertices = [(-1, -1), (1, -1), (1, 1), (-1, 1), (-1, width), (0, 0), (-1, -width)]
+    exact = lambda x: jnp.hypot(*x) ** 2.5 * jnp.sin(2.5 * jnp.arctan2(x[1], x[0]))
+    cloud = js.from_polygon(vertices, 0.1)
+    sol = js.solve(js.Problem(lambda u, x: js.laplacian(u)(x), {"boundary": js.dirichlet(exact)}), cloud)
+    error = np.abs(sol.u - np.nan_to_num(jax.vmap(exact)(cloud.points)))
+    assert error.max() < 5e-4 and not sol.flags
+
+
+def test_a_plate_thinner_than_its_spacing_is_no_gap():
+    """Its sides have opposite normals as well, and are behind each other."""
+    cloud = js.from_polygon([(0, 0), (2, 0), (2, 0.03), (0, 0.03)], lambda x: 0.012 + 0 * x[:, 0])
+    exact = lambda x: jnp.exp(x[0]) * jnp.sin(x[1] + 1.0)
+    sol = js.solve(js.Problem(lambda u, x: js.laplacian(u)(x), {"boundary": js.dirichlet(exact)}), cloud)
+    assert np.abs(sol.u - jax.vmap(exact)(cloud.points)).max() < 1e-6

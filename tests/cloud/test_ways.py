@@ -15,7 +15,7 @@ SLIT = [(0, 0), (1, 0), (1, 1), (-1, 1), (-1, -1), (1, -1), (1, -0.01)]
 
 def walls(cloud):
     problem = js.Problem(lambda u, x: js.laplacian(u)(x), {"boundary": js.dirichlet(0.0)})
-    return walls_of(problem, cloud, periodic_images(problem, cloud)[0])
+    return walls_of(problem, cloud, periodic_images(problem, cloud, np.zeros(len(cloud), bool))[0])
 
 
 def test_a_way_round_is_long_and_a_straight_one_is_not():

@@ -18,6 +18,9 @@ from jsmitsm.cloud.sight.ways import Looked, Ways
 _FACING, _CUT = 0.5, 0.3
 # Opposite normals, and how far in front of each other (in parts of their distance) particles with such normals are.
 _OPPOSITE, _APART = -0.5, 0.003
+# Of walls back to back the sign tells: across the narrowest slit they are in front of each other, in a thin part of the
+# domain behind.
+_BACK, _TOUCHING = -0.98, 1e-9
 # Nearest particles that are linked, and boundary particles that may cut a link, by dimension.
 _LINKS, _CUTTERS = {1: 4, 2: 12, 3: 30}, {1: 4, 2: 10, 3: 20}
 # No link is longer than so many spacings.
@@ -245,11 +248,12 @@ class Walls:
         crossing = ((one < -small) & (two > small)) | ((two < -small) & (one > small))
         cut |= crossing & ~from_a & ~from_b & (aside <= cover[near])
         # Between particles of walls that face each other, however flat the link lies.
-        ahead_a, ahead_b = from_a & (two > _APART * length), from_b & (one > _APART * length)
-        facing = np.flatnonzero(ahead_a.any(axis=1) & ahead_b.any(axis=1))
-        opposite = np.einsum("ekd,eld->ekl", n[facing], n[facing]) < _OPPOSITE
-        pair = ahead_a[facing][:, :, None] & ahead_b[facing][:, None, :]
-        cut[facing] |= (pair & opposite).any(axis=2)
+        for apart, turned in ((_APART, _OPPOSITE), (_TOUCHING, _BACK)):
+            ahead_a, ahead_b = from_a & (two > apart * length), from_b & (one > apart * length)
+            facing = np.flatnonzero(ahead_a.any(axis=1) & ahead_b.any(axis=1))
+            opposite = np.einsum("ekd,eld->ekl", n[facing], n[facing]) < turned
+            pair = ahead_a[facing][:, :, None] & ahead_b[facing][:, None, :]
+            cut[facing] |= (pair & opposite).any(axis=2)
         return cut.any(axis=1)
 
     def _surfels(self, members: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
