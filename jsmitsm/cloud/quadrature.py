@@ -47,7 +47,8 @@ def quadrature(cloud: Cloud, group: str | None = None, degree: int = 8) -> Quadr
     to 1e-6, whatever the degree. Where it is not known, facets cut edges off: areas and fluxes are of first order there
     and wrong by percents at usual spacings.
 
-    A facet belongs to the group whose normals it continues. Over the domain the normals are NaN; over the domain of a
+    A facet belongs to the group whose normals it continues. Where a group ends inside of a smooth or flat side nothing
+    tells where, between its last particle and the next: its integrals are of first order there. Over the domain the normals are NaN; over the domain of a
     cloud of several regions the rules of all stand one after another; over an interface ``"a|b"`` the normals point
     from a to b.
 
