@@ -48,9 +48,9 @@ def quadrature(cloud: Cloud, group: str | None = None, degree: int = 8) -> Quadr
     and wrong by percents at usual spacings.
 
     A facet belongs to the group whose normals it continues. Where a group ends inside of a smooth or flat side nothing
-    tells where, between its last particle and the next: its integrals are of first order there. Over the domain the normals are NaN; over the domain of a
-    cloud of several regions the rules of all stand one after another; over an interface ``"a|b"`` the normals point
-    from a to b.
+    tells where, between its last particle and the next: its integrals are of first order there. Over the domain the
+    normals are NaN; over the domain of a cloud of several regions the rules of all stand one after another; over an
+    interface ``"a|b"`` the normals point from a to b.
 
     Parameters
     ----------
