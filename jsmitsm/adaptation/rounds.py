@@ -111,8 +111,8 @@ class Rounds:
             self.flags = []
         if self.quantity is not None and self.number_before is None and not self.reached:
             # A number of one cloud is no nearer to the truth than its solution, as far as anybody knows.
-            values, error = (np.asarray(v) for v in (self.solution.u, self.solution.error_estimate()))
-            self.error = max(self.error, size(error, values, np.ones(len(values)), "max", self.solution.cloud.dim))
+            sol, h = self.solution, self.spacing(np.asarray(self.solution.cloud.points))
+            self.error = max(self.error, measured(sol, h, self._operator_order(sol), "max", None).error)
 
     def _search(self, cloud: Cloud, spacing: SpacingField, shown: Any) -> None:
         self.data = data_of(self.problem, cloud.dim, _DEGREE)

@@ -12,6 +12,7 @@ from jsmitsm.evolution.run import Run
 from jsmitsm.evolution.space.semidiscrete import Semidiscrete
 from jsmitsm.evolution.space.system import System
 from jsmitsm.evolution.steps import dense_output
+from jsmitsm.evolution.steps.in_time import PARTS as ALL_PARTS
 from jsmitsm.evolution.steps.newton import Newton
 from jsmitsm.evolution.steps.stepping import RadauStepper, Stepper
 from jsmitsm.evolution.steps.tableaux import KENCARP4, RADAU
@@ -21,7 +22,8 @@ from jsmitsm.taylor.multi_indices import HIGHEST
 
 # So many times are looked at. From one to the next the error goes in so many parts, in each of which the misfit is
 # looked at so many times at most.
-LOOKS, PARTS, MOST = 10, 4, 4
+LOOKS, MOST = 10, 4
+PARTS = ALL_PARTS // LOOKS
 
 
 @bar("error estimate", parts=(*PENCIL, ("times", 4.0)))

@@ -11,8 +11,9 @@ import numpy as np
 from jsmitsm.evolution.estimate import estimated, in_space
 from jsmitsm.evolution.evolution import Evolution, Report
 from jsmitsm.evolution.run import Run
+from jsmitsm.evolution.space.system import VANISHING
 from jsmitsm.evolution.steps import dense_output
-from jsmitsm.evolution.steps.control import controlled
+from jsmitsm.evolution.steps.control import FIRST, controlled
 from jsmitsm.evolution.steps.in_time import InTime, looks
 from jsmitsm.evolution.steps.stepping import Step, Stopped
 from jsmitsm.runtime.errors import SolveError
@@ -25,9 +26,9 @@ HISTORY = 2**29
 BLOWN = 1e30
 # An estimated error, in time or in all, above this part of the solution is a flag.
 LARGE = 0.02
-# A start of less than this part of what data make in one of so many parts of a run is one at rest. No step is longer
-# then than such a part, or it would step over what the data do between: 2^-6 of the run.
-_REST, _PARTS, _SEEN = 1e-6, 64, 6
+# A start of less than this part of what data make in one of so many parts of a run, each as long as its first step, is
+# one at rest. No step is longer then, or it would pass over what the data do between.
+_REST, _PARTS = 1e-6, 2**FIRST
 # Of the schemes, as ``stats`` tells them.
 NAMES = {
     "esdirk": "KenCarp4", "imex": "KenCarp4, implicit and explicit", "radau": "Radau IIA 5", "euler": "backward Euler",
@@ -83,7 +84,7 @@ def marched(run: Run, steps: int | None, tol: float | None, parts: np.ndarray, s
     history = History(run, wanted)
     fault = ""
     try:
-        y = started(run, (t1 - t0) / (steps or 64))
+        y = started(run, (t1 - t0) / (steps or _PARTS))
         if steps is None:
             assert tol is not None
             _adaptive(run, y, t0, t1, tol, history, shown)
@@ -100,7 +101,7 @@ def started(run: Run, h: float) -> np.ndarray:
     y, asked, jumps = semi.begun(run.start, t0)
     force, held = _now(semi, t0, y)
     jump = asked - held
-    small = 1e-7 * h
+    small = VANISHING * h
     if run.algebraic:  # a vanishing step of backward Euler takes the impulse, another settles what holds always
         resolvent, mass = semi.system.resolvent(small), semi.system.mass
         y = resolvent.solve(mass(y) + jump + small * force)
@@ -183,7 +184,7 @@ def _adaptive(run: Run, y: np.ndarray, t0: float, t1: float, tol: float, history
     least = foreseen if run.semi.system.largest(y) < _REST * foreseen else 0.0
     counts = controlled(
         stepper, y, t0, t1, tol, added, tell,
-        lambda error: _size(run, error, max(history.scale, least)), _SEEN if least else 0,
+        lambda error: _size(run, error, max(history.scale, least)), FIRST if least else 0,
     )  # fmt: skip
     run.counts.update(counts)
 

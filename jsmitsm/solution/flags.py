@@ -89,14 +89,15 @@ CONTRADICTED = 0.05
 BLIND = 1e6
 # Beyond so many particles an error estimate would cost more than a look at the flags may.
 MANY = 200_000
+Told = tuple[list[str], dict[str, float]]
 
 
-def flags(run: Any, values: Any, nums: Any, estimated: Callable[..., float]) -> tuple[list[str], dict[str, float]]:
+def flags(run: Any, values: Any, nums: Any, estimated: Callable[[], float], known: bool = False) -> Told:
     """Sentences, none for a healthy solution, and the measures behind them.
 
     estimated: the estimated error as a part of the solution, asked for unless the cheap tests clear the solution, which
-    they can do for linear problems of one field in the leave-one-out form, or find what no estimate can excuse.
-    Where several processes have a part each, all ask together and are told the same.
+    they can do for linear problems of one field in the leave-one-out form, or find what no estimate can excuse. known:
+    whether it is there already. Where several processes have a part each, all ask together and are told the same.
     """
     values, told = np.asarray(values, float), whole(run.disc)
     if told.total(int(not np.isfinite(told.own(values)).all())):
@@ -112,7 +113,7 @@ def flags(run: Any, values: Any, nums: Any, estimated: Callable[..., float]) -> 
     blind = found.get("excess", 0.0) > BLIND or found.get("coefficient", 0.0) > DIVERGENT
     if certain or resonant or blind or hopeless(found):
         return doubts + certain, found
-    if particles(run.disc) > MANY and np.isnan(estimated(True)):
+    if particles(run.disc) > MANY and not known:
         return doubts, found
     cleared = _cleared(run, values, found, doubts)
     if not cleared:

@@ -389,11 +389,11 @@ class Run:
         whole = self.factor.condition()
         return health.condition_numbers(self.disc, self.nums), float(whole)
 
-    def flags(self, estimated: Callable[..., float]) -> list[str]:
+    def flags(self, estimated: Callable[[], float], known: bool = False) -> list[str]:
         """What speaks against the solution, in sentences; see ``jsmitsm.solution.flags``."""
         if self.values is None or self.nums is None:
             return list(self.against)
-        return flags(self, self.values, self.nums, estimated)[0] + self.against
+        return flags(self, self.values, self.nums, estimated, known)[0] + self.against
 
     def stats(self) -> dict[str, Any]:
         """What a user may want to know about the solve."""

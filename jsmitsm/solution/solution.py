@@ -26,7 +26,7 @@ from jsmitsm.solution.run import Run
 class Report(Protocol):
     """What the solve can still say of itself when asked."""
 
-    def flags(self, estimated: Callable[..., float]) -> list[str]: ...
+    def flags(self, estimated: Callable[[], float], known: bool = False) -> list[str]: ...
 
     def condition_numbers(self) -> tuple[np.ndarray, float]: ...
 
@@ -239,10 +239,8 @@ class Solution(Anywhere):
         self._size(abs(found.error), found.units)
         return found
 
-    def _estimated(self, at_hand: bool = False) -> float:
-        """The estimated error over the solution, infinite where there is none; at_hand: NaN where nobody asked yet."""
-        if at_hand and self._error is None:
-            return np.nan
+    def _estimated(self) -> float:
+        """The estimated error over the solution, infinite where there is none."""
         try:
             self.error_estimate()
         except (ValueError, SolveError) as fault:
@@ -263,7 +261,7 @@ class Solution(Anywhere):
         """
         self.refuse_stacked()
         if self._found is None and self._report is not None:
-            self._found = self._report.flags(self._estimated)
+            self._found = self._report.flags(self._estimated, self._error is not None)
         return explained([*(self._found or []), *self.stats.get("objections", []), *too_large(self._share)])
 
     @explaining

@@ -12,6 +12,7 @@ import pytest
 import jsmitsm as js
 from benchmarks.adaptation import CASES
 from benchmarks.nist import reentrant
+from jsmitsm.adaptation import measure
 from jsmitsm.adaptation.data import data_of, unresolved
 from jsmitsm.adaptation.edges import edges
 from jsmitsm.adaptation.first_cloud import first_cloud
@@ -22,6 +23,7 @@ from jsmitsm.adaptation.measure import Measured
 from jsmitsm.adaptation.rounds import Rounds
 from jsmitsm.adaptation.spacing_field import GROWTH, SpacingField
 from jsmitsm.adaptation.witness import Earlier, remembered, stands_out, unseen
+from jsmitsm.runtime.errors import SolveError
 
 CORNER = [(0, 0), (1, 0), (1, 1), (-1, 1), (-1, -1), (0, -1)]
 SQUARE = [(0, 0), (1, 0), (1, 1), (0, 1)]
@@ -478,6 +480,17 @@ def test_a_steep_layer_of_a_nonlinear_equation():
     assert found.reached and abs(found.quantity / -slope - 1) < 1e-5
     first = js.adapt(problem, line, 1e-5, max_rounds=1, **asked)
     assert not first.reached and first.error > 1e-2  # far more than the estimate of the number alone
+
+
+def test_a_number_of_a_solution_without_an_estimate(monkeypatch):
+    """It is handed out, and that nothing is known of its error."""
+
+    def fails(sol):
+        raise SolveError("nothing is determined", [])
+
+    monkeypatch.setattr(measure, "_corrected", fails)
+    found = js.adapt(GOOD, line, 1e-3, quantity=lambda sol: sol.flux("left"), max_rounds=1)
+    assert not found.reached and found.error == np.inf and np.isfinite(found.solution.u).all()
 
 
 def test_numbers_that_move_more_than_was_thought_are_not_believed():

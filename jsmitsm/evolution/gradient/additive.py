@@ -38,15 +38,15 @@ def back(
     at, system, pull, ys = bars.at, bars.system, bars.pull, [y, *stages]
     h, g, s = float(at.h), scheme.gamma, scheme.stages - 1
     first = k * s
-    closes = pull is not None and newton is None
+    explicit = pull if newton is None else None
     q_bar = np.zeros((s + 1, system.size))
-    if pull is not None and newton is None:
+    if explicit is not None:
         *ys, end = ys
         last = system.settled(h).solve_transposed(y_bar)
         q_bar = np.multiply.outer(h * scheme.closing, last)
         bars.mass(last[None], (ys[-1] - end)[None])
-        pull.collect(q_bar[s], ys[s], first + s)
-        y_bar = y_bar + pull.state(q_bar[s], ys[s], first + s)
+        explicit.collect(q_bar[s], ys[s], first + s)
+        y_bar = y_bar + explicit.state(q_bar[s], ys[s], first + s)
     low, p_bar = np.empty((s, system.size)), np.zeros((s + 1, system.size))
     stage_bar = y_bar
     for i in range(s, 0, -1):
@@ -62,7 +62,7 @@ def back(
         stage_bar = -system.stiff_transposed(p_bar[i - 1])
         if pull is not None:
             asked = p_bar[i - 1]
-            if closes:
+            if explicit is not None:
                 asked = (h * scheme.explicit[i:, i - 1]) @ low[i - 1 :] + q_bar[i - 1]
             stage_bar += pull.state(asked, ys[i - 1], first + i - 1)
             if newton is None or i == 1:
@@ -70,7 +70,7 @@ def back(
     if bars.timed:
         rates, pushes = _rates(scheme, bars, newton is not None, ys, first)
         bars.h += sum(float(v @ rate) for v, rate in zip(low, rates))
-        bars.h += sum(float(last @ q) * c for c, q in zip(scheme.closing, pushes)) if closes else 0.0
+        bars.h += 0.0 if explicit is None else sum(float(last @ q) * c for c, q in zip(scheme.closing, pushes))
     total, states = low.sum(axis=0), np.array(ys)
     bars.jump[first] += total
     bars.jump[first + 1 : first + s + 1] -= low

@@ -13,6 +13,7 @@ from jsmitsm.evolution.gradient.adjoint import Plan, states
 from jsmitsm.evolution.gradient.inputs import Inputs, Push
 from jsmitsm.evolution.run import Run, drifted
 from jsmitsm.evolution.space.semidiscrete import Semidiscrete, centred
+from jsmitsm.evolution.space.system import VANISHING
 from jsmitsm.evolution.steps import dense_output
 from jsmitsm.evolution.steps.tableaux import Additive, Radau
 from jsmitsm.runtime.tracers import is_traced
@@ -129,7 +130,7 @@ def _started(run: Run, samples: list[Any], force: Any, jump: Any, h: Any, still:
         if gap <= 1e-13 * np.abs(np.asarray(flat[0])).max(initial=0.0):
             return y
     moved = semi.masses_held[-1].times(flat[-1][semi.held]) - jump
-    small = 1e-7 * h
+    small = VANISHING * h
     if run.algebraic:
         resolvent, t = semi.system.resolvent(small), run.t[0] + small
         later = semi.samples(jnp.reshape(t, 1))

@@ -14,7 +14,7 @@ from jsmitsm.linear.sparse import Factor
 from jsmitsm.runtime.tracers import is_traced
 
 # A step of so small a part moves nothing that has a rate.
-_VANISHING = 1e-7
+VANISHING = 1e-7
 
 
 class System:
@@ -86,7 +86,7 @@ class System:
     def settled(self, h: Any) -> Resolvent:
         """The inverse of E. What has no rate holds after it too: there a vanishing part of a step h is taken."""
         none = self.undriven().any()
-        return self.resolvent(_VANISHING * h if none else jnp.zeros(()) if is_traced(h) else 0.0)
+        return self.resolvent(VANISHING * h if none else jnp.zeros(()) if is_traced(h) else 0.0)
 
     @property
     def factorisations(self) -> int:

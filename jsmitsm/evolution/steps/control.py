@@ -10,8 +10,8 @@ import numpy as np
 from jsmitsm.evolution.steps.stepping import Step, Stopped
 from jsmitsm.runtime.errors import SolveError
 
-# The smallest step is so many halvings of the whole.
-DEEPEST = 40
+# The first and the smallest step are so many halvings of the whole.
+FIRST, DEEPEST = 6, 40
 _SAFETY = 0.8
 
 
@@ -27,7 +27,7 @@ def controlled(
     whole = t1 - t0
     step = stepper.first(y, t0)
     keep(t0, step)
-    level, place = 6, 0  # the time is t0 + place whole / 2^level
+    level, place = FIRST, 0  # the time is t0 + place whole / 2^level
     counts = {"steps": 0, "rejected": 0}
     power = 1.0 / min(stepper.order, 4)
     while place < 2**level:

@@ -189,7 +189,7 @@ class RegionsRun(Run):
             out[part.ids] = health.condition_numbers(part.disc, own)
         return out, float(self.factor.condition())
 
-    def flags(self, estimated: Callable[..., float]) -> list[str]:
+    def flags(self, estimated: Callable[[], float], known: bool = False) -> list[str]:
         """What speaks against the solution: the tests of each region, and those of the whole system."""
         if self.values is None or self.nums is None:
             return list(self.against)
@@ -214,8 +214,9 @@ class RegionsRun(Run):
             told = [f"In the region {part.name!r}: {line[0].lower()}{line[1:]}" for line in told]
             (certain if flags.hopeless(found) else doubts).extend(told)
         told = [*weak_copies(self.bound), *singular(self.disc, values)]
-        share = estimated() if len(values) <= flags.MANY else np.inf
-        if self.squared and not np.isfinite(share) and len(values) <= flags.MANY:
+        asked = known or len(values) <= flags.MANY
+        share = estimated() if asked else np.inf
+        if self.squared and not np.isfinite(share) and asked:
             doubts.append(
                 f"The region(s) {sorted(self.squared)} take the least-squares form, whose error no other order can "
                 "tell here: compare with a finer cloud."
