@@ -167,7 +167,12 @@ def _add(ring: Ring, eqn: Any, x: Array, y: Array) -> Array:
 @rule("sub")
 def _sub(ring: Ring, eqn: Any, x: Array, y: Array) -> Array:
     x, y = align(x, y)
-    return x - y if x.shape[0] == y.shape[0] else add(x, -y)
+    n = min(len(x), len(y))
+    if len(x) == len(y) or not on_host(x, y) or x.shape[1:] != y.shape[1:] or x.dtype != y.dtype:
+        return x - y if len(x) == len(y) else add(x, -y)
+    out = x.copy() if n < len(x) else -y
+    np.subtract(x[:n], y[:n], out=out[:n])
+    return out
 
 
 @rule("neg")

@@ -116,10 +116,13 @@ def mul(ring: Ring, x: Array, y: Array) -> Array:
         if len(ours) > len(theirs):
             x, y, left, right, ours, theirs = y, x, right, left, theirs, ours
         sparse = 2 * len(theirs) < len(y)
-        if not sparse and y[0].size >= _LONG:
-            _add_products(out, x, y, ours, product_runs(ring.dim, left, right, degree))
-            return out
         rows = product_rows(ring.dim, left, right, degree)
+        if y[0].size >= _LONG:
+            if sparse:
+                _add_pairs(out, x, y, ours, theirs, rows)
+            else:
+                _add_products(out, x, y, ours, product_runs(ring.dim, left, right, degree))
+            return out
         for a in ours:
             n, places = rows[a]
             if n and sparse:
@@ -144,15 +147,30 @@ def _add_products(out: np.ndarray, x: np.ndarray, y: np.ndarray, ours: np.ndarra
             np.add(place, part[low:high], out=place)
 
 
+def _add_pairs(
+    out: np.ndarray, x: np.ndarray, y: np.ndarray, ours: np.ndarray, theirs: np.ndarray, rows: Any
+) -> None:
+    """Add x y to ``out``, which is zero, where few coefficients do not vanish: pair by pair, most with a place of
+    their own."""
+    product, met = np.empty(out.shape[1:], out.dtype), set()
+    for a in ours:
+        n, places = rows[a]
+        some = theirs[: np.searchsorted(theirs, n)]
+        at = some + places.start if isinstance(places, slice) else places[some] if n else some
+        for b, c in zip(some.tolist(), at.tolist(), strict=True):
+            if c in met:
+                out[c] += np.multiply(x[a], y[b], out=product)
+            else:
+                np.multiply(x[a], y[b], out=out[c, ...])
+                met.add(c)
+
+
 def _filled_rows(x: np.ndarray) -> np.ndarray:
     """The coefficients that do not vanish: few of a function of one coordinate alone."""
     flat = x.reshape(len(x), -1)
-    filled = flat[:, 0] != 0
-    if filled.all():
+    if (flat[:, 0] != 0).all():
         return np.arange(len(x))
-    for k in np.flatnonzero(~filled):
-        filled[k] = flat[k].any()
-    return np.flatnonzero(filled)
+    return np.flatnonzero((flat != 0).any(axis=1))
 
 
 def block(ring: Ring, x: Array, degree: int) -> Array:
@@ -341,7 +359,14 @@ def along_line(ring: Ring, x: Array, function: Callable[[Ring, Array], Array]) -
     exponents, weights = powers(ring.dim, degree)
     shape = (len(weights), ring.dim, *(1,) * (x.ndim - 1))
     monomials = (slope ** exponents.reshape(shape)).prod(axis=1) * weights.reshape(-1, *(1,) * (x.ndim - 1))
-    return line[degrees(ring.dim, degree)] * monomials.astype(x.dtype)
+    monomials, degree_at = monomials.astype(x.dtype), degrees(ring.dim, degree)
+    filled = _filled_rows(monomials)
+    if 2 * len(filled) > len(monomials):
+        return line[degree_at] * monomials
+    out = np.zeros((len(monomials), *line.shape[1:]), line.dtype)
+    for k in filled:
+        np.multiply(line[degree_at[k]], monomials[k], out=out[k, ...])
+    return out
 
 
 def full_series(ring: Ring, x: Array, batch: int) -> Array:
