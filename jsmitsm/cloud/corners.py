@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm.cloud.cloud import INTERIOR, Cloud, kept
+from jsmitsm.cloud.levelset import SdfRegion
 from jsmitsm.runtime.tracers import concrete, is_traced
 
 # Nearest particles of the group that are asked, by dimension.
@@ -22,26 +23,32 @@ _FLAT, _EQUAL = 1e-6, 1e-9
 _OWN, _ACROSS = np.cos(np.radians(1.0)), 0.1
 # Sides come in the order of their normals in this direction, whatever the order of particles; no corner has more.
 _FIRST, _SIDES = np.array([1.0, 0.6, 0.36]), 4
+# Where neighbours' normals turn by more (its cosine) there may be a corner, and the shape is asked this part of their
+# distance away; at a tip, however sharp, normals go on turning by more than this part of it.
+_TURN, _BESIDE, _STEADY = np.cos(np.radians(4.0)), 1e-5, 0.1
 
 
 def side_normals(cloud: Cloud) -> Any:
-    """The normals (N, D) of a cloud that has them, those of a flat side at corners within a group.
+    """The normals (N, D) of a cloud that has them, those of one side at corners within a group.
 
-    Corners between curved sides keep theirs: a particle at the tip of an ellipse looks alike.
+    Between curved sides the shape is asked; where it is not known the normals stay: a tip of an ellipse looks alike.
     """
     at, sides = _known(cloud)
-    return _replaced(cloud.normals, at, lambda given: given[sides[:, 0]])
+    curved, theirs = _known_curved(cloud)
+    return _replaced(_replaced(cloud.normals, at, lambda given: given[sides[:, 0]]), curved, lambda _: theirs[:, 0])
 
 
 def mean_normals(cloud: Cloud) -> Any:
-    """The same, at reentrant corners with the means of all flat sides' normals, shorter than one.
+    """The same, at reentrant corners with the means of all sides' normals, shorter than one.
 
     What is linear in the normal and holds for every side holds for them. Solutions are singular there: one side alone
     makes three times their errors, while at other corners it is better than the mean.
     """
     at, sides = _known(cloud)
     there = (sides >= 0)[..., None]
-    return _replaced(cloud.normals, at, lambda given: (given[sides] * there).sum(axis=1) / there.sum(axis=1))
+    flat = _replaced(cloud.normals, at, lambda given: (given[sides] * there).sum(axis=1) / there.sum(axis=1))
+    curved, theirs = _known_curved(cloud)
+    return _replaced(flat, curved, lambda _: np.nanmean(theirs, axis=1))
 
 
 def _replaced(normals: Any, at: np.ndarray, found: Any) -> Any:
@@ -60,6 +67,18 @@ def _known(cloud: Cloud) -> tuple[np.ndarray, np.ndarray]:
     if cloud.dim == 1 or points is None or normals is None:
         return np.zeros(0, int), np.zeros((0, _SIDES), int)
     return kept(cloud, "corners", lambda: _corners(np.asarray(points), np.asarray(normals), cloud.groups))
+
+
+def _known_curved(cloud: Cloud) -> tuple[np.ndarray, np.ndarray]:
+    """The particles (C,) at other corners within their group, and the normals (C, 2, 2) of their sides, NaN for none.
+
+    In space no particles lie on edges between curved sides.
+    """
+    points, normals = concrete(cloud.points), concrete(cloud.normals)
+    if cloud.dim != 2 or points is None or normals is None or not isinstance(cloud._shape, SdfRegion):
+        return np.zeros(0, int), np.zeros((0, 2, cloud.dim))
+    known = _known(cloud)[0]
+    return kept(cloud, "curved corners", lambda: _curved(np.asarray(points), np.asarray(normals), cloud, known))
 
 
 def _corners(points: np.ndarray, normals: np.ndarray, groups: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -99,3 +118,37 @@ def _in_group(points: np.ndarray, normals: np.ndarray, ids: np.ndarray) -> tuple
         score = np.where(same[rows, first], -np.inf, score)
     good = sides[:, 0] >= 0
     return ids[some[good]], np.where(sides[good] >= 0, ids[sides[good]], -1)
+
+
+def _curved(points: np.ndarray, normals: np.ndarray, cloud: Cloud, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    from scipy.spatial import cKDTree
+
+    bounds = np.concatenate([np.zeros(0, int), *(ids for name, ids in cloud.groups.items() if name != INTERIOR)])
+    bounds = bounds[np.isfinite(normals[bounds]).all(axis=1)]
+    if len(bounds) < 3:
+        return np.zeros(0, int), np.zeros((0, 2, 2))
+    away, near = cKDTree(points[bounds]).query(points[bounds], k=[2, 3])
+    turns = np.einsum("bd,bkd->bk", normals[bounds], normals[bounds][near]).min(axis=1) < _TURN
+    some = turns & (away[:, 0] > 0) & ~np.isin(bounds, known)
+    at, normal, step = points[bounds[some]], normals[bounds[some]], _BESIDE * away[some, 0]
+    across = np.stack([-normal[:, 1], normal[:, 0]], axis=1)
+    ways = np.stack([across, -across], axis=1)
+
+    def beside(far: float) -> np.ndarray:
+        there = at[:, None] + far * step[:, None, None] * ways
+        return cloud._shape.distance(there.reshape(-1, 2))[1].reshape(there.shape)
+
+    once, twice = beside(1.0), beside(2.0)
+    sides = 2.0 * once - twice
+    sides /= np.maximum(np.linalg.norm(sides, axis=2, keepdims=True), 1e-300)
+    turn = np.linalg.norm(sides[:, 0] - sides[:, 1], axis=1)
+    steady = np.linalg.norm(once - twice, axis=2).max(axis=1) < _STEADY * turn
+    own = np.einsum("bd,bkd->bk", normal, sides).max(axis=1) > _OWN
+    corner = steady & ~own & (np.einsum("bd,bd->b", sides[:, 0], sides[:, 1]) < _OWN)
+    order = np.argsort(-sides @ _FIRST[:2], axis=1)[..., None]
+    first, second = np.moveaxis(np.take_along_axis(sides, order, axis=1), 1, 0)
+    way = np.take_along_axis(ways, order, axis=1)[:, 1]
+    along = way - np.einsum("bd,bd->b", way, second)[:, None] * second
+    # The second side counts where it lies before the first one.
+    second[np.einsum("bd,bd->b", along, first) <= 0.0] = np.nan
+    return bounds[some][corner], np.stack([first, second], axis=1)[corner]

@@ -90,11 +90,8 @@ def test_smooth_boundaries_keep_their_normals():
     """Tips of ellipses that few particles see, and straight sides that end in arcs, have no corners."""
     ellipse = js.from_sdf(lambda x: jnp.hypot(x[0] / 2, x[1] / 0.3) - 1, ((-2.2, -0.5), (2.2, 0.5)), 0.15)
     stadium = js.from_sdf(js.sdf.capsule((-1, 0), (1, 0), 0.5), ((-2, -1), (2, 1)), 0.12)
-    lens = js.from_sdf(
-        js.sdf.intersection(js.sdf.circle((-0.5, 0), 1.0), js.sdf.circle((0.5, 0), 1.0)), ((-1, -1), (1, 1)), 0.1
-    )
     ball = js.from_sdf(js.sdf.sphere((0, 0, 0), 1.0), ((-1,) * 3, (1,) * 3), 0.3)
-    for cloud in (ellipse, stadium, lens, ball, js.interval(0, 1, 9), js.rectangle((0, 0), (1, 1), (6, 6))):
+    for cloud in (ellipse, stadium, ball, js.interval(0, 1, 9), js.rectangle((0, 0), (1, 1), (6, 6))):
         assert side_normals(cloud) is cloud.normals and mean_normals(cloud) is cloud.normals
 
 
@@ -126,3 +123,48 @@ def test_derivatives_by_the_normals_are_those_of_the_side():
     step = 2e-7  # sides are flat but for a millionth
     difference = (mean(step) - mean(-step)) / (2 * step)
     assert np.isclose(jax.grad(mean)(0.0), difference, rtol=1e-5)
+
+
+def two_circles(apart, radius, join):
+    """The lens of two circles, or what both cover; and the slope of |x|^2 / 2 along its sides, the same at corners."""
+    centres = np.array([[-apart, 0.0], [apart, 0.0]])
+    shape = join(*(js.sdf.circle(tuple(c), radius) for c in centres))
+    lens = join is js.sdf.intersection
+
+    def slope(x):
+        centre = jnp.where((x[0] > 0) == lens, centres[0, 0], centres[1, 0])
+        return x @ (x - jnp.array([1.0, 0.0]) * centre) / radius
+
+    return shape, slope
+
+
+@pytest.mark.parametrize("join", ["intersection", "union"])
+@pytest.mark.parametrize("kind", ["robin", "condition"])
+def test_corners_between_curved_sides(join, kind):
+    """One group all around: what is said of a side holds to its end, reentrant corners included."""
+    shape, slope = two_circles(0.5, 1.0, getattr(js.sdf, join))
+    cloud = js.from_sdf(shape, ((-1.6, -1.1), (1.6, 1.1)), 0.2)
+    if kind == "robin":
+        bc = js.robin(1.0, 1.0, lambda x: 0.5 * (x @ x) + slope(x))
+    else:
+        bc = js.condition(lambda u, x, n: u(x) + js.grad(u)(x) @ n - 0.5 * (x @ x) - slope(x))
+    sol = js.solve(js.Problem(lambda u, x: js.laplacian(u)(x) - 2.0, {"boundary": bc}), cloud)
+    assert np.abs(sol.u - 0.5 * (cloud.points**2).sum(axis=1)).max() < 1e-10 and not sol.flags
+    at = np.flatnonzero(np.abs(cloud.points[:, 0]) < 1e-9)
+    at = at[np.isfinite(cloud.normals[at, 0])]
+    assert len(at) == 2 and np.abs(cloud.normals[at, 0]).max() < 1e-9  # the cloud's own are the bisectors
+
+
+def test_sharp_tips_are_no_corners():
+    """Normals turn fast there, and go on turning."""
+    for radii in ((1.0, 0.2), (1.0, 0.05)):
+        cloud = js.from_sdf(js.sdf.ellipse((0.0, 0.0), radii), ((-1.1, -0.3), (1.1, 0.3)), 0.05)
+        assert np.array_equal(side_normals(cloud), cloud.normals, equal_nan=True)
+        assert np.array_equal(mean_normals(cloud), cloud.normals, equal_nan=True)
+
+
+def test_a_corner_between_groups_keeps_the_normal_of_its_own_side():
+    shape, slope = two_circles(0.5, 1.0, js.sdf.intersection)
+    sides = {"left": lambda x: x[:, 0] < 1e-9, "right": lambda x: x[:, 0] >= 1e-9}
+    cloud = js.from_sdf(shape, ((-0.6, -1.0), (0.6, 1.0)), 0.15, groups=sides)
+    assert np.array_equal(side_normals(cloud), cloud.normals, equal_nan=True)
