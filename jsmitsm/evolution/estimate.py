@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from jsmitsm.evolution.run import Run
+from jsmitsm.evolution.run import Run, drifted
 from jsmitsm.evolution.space.semidiscrete import Semidiscrete
 from jsmitsm.evolution.space.system import System
 from jsmitsm.evolution.steps import dense_output
@@ -33,20 +33,20 @@ def in_space(
     """Times (K + 1,), and estimated errors w - u (K + 1, N, F) at them: A' w = B' f + Bg' g, f = -(M u' + N).
 
     Dashes are of order p + 2. What the rates leave over drives the error, from zero at the start. history: times and
-    values of the steps; rates: theirs, of second order in time. Zero where nothing is known: quasilinear problems.
+    values of the steps; rates: theirs, of second order in time. Zero where nothing is known: at the highest orders.
     The third is where the errors of steps, lumps (size,) at times, have gone on the way, where that is known.
     """
     semi, (steps, values) = run.semi, history
-    if len(steps) < 2 or run.timed.quasilinear or run.order + 2 > HIGHEST:
+    if len(steps) < 2 or run.order + 2 > HIGHEST:
         return steps[[0, -1]], *np.zeros((2, 2, semi.n, semi.fields))
     grid = np.linspace(steps[0], steps[-1], min(LOOKS, len(steps) - 1) + 1)
     # Pairs of fields that drive one another are the ones that are damped.
     if semi.second or run.damping:
         integrated = _travelled if semi.second else _summed
-        errors = integrated(semi, run.finer(), steps, values, rates, grid)
+        errors = integrated(semi, run.finer(float(steps[0]), values[0]), steps, values, rates, grid)
         carried = np.zeros_like(errors)
     else:
-        errors, carried = _integrated(semi, run.finer(), steps, values, rates, grid, lumps)
+        errors, carried = _integrated(run, steps, values, rates, grid, lumps)
     for each in (errors, carried):
         each.reshape(len(grid), -1)[:, semi.held] = 0.0
     return grid, errors, carried
@@ -68,24 +68,27 @@ def estimated(
 
 
 def _integrated(
-    semi: Semidiscrete, high: Semidiscrete, steps: Any, values: Any, rates: Any, grid: np.ndarray,
-    lumps: list[tuple[float, np.ndarray]],
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    run: Run, steps: Any, values: Any, rates: Any, grid: np.ndarray, lumps: list[tuple[float, np.ndarray]]
+) -> tuple[np.ndarray, np.ndarray]:
     """Errors (K + 1, N, F) in space and in time at equidistant times: E e' + A e + B N'(u) e = misfit, from e = 0.
 
     Those in time are driven by the errors of the steps, lumps (size,) where they were made. By the diagonally implicit
     method of two stages and second order, which damps what is stiff and lets grow what does (Alexander, SIAM J. Numer.
     Anal. 14, 1977). The misfit is its mean over a step: much of it may be over soon.
     """
-    h, gamma = float(grid[1] - grid[0]) / PARTS, 1.0 - math.sqrt(0.5)
-    system, nothing = high.system, np.zeros(len(high.held))
-    solve, fits = _around(semi, high, steps, values, gamma * h), looker(semi)
-    misfit = lambda t: _misfit(semi, high, steps, values, rates, float(t))  # noqa: E731
-    y, before = np.zeros((system.size, 2)), misfit(grid[0])
-    out = [np.zeros((semi.n, semi.fields, 2))]
+    h, gamma, semi = float(grid[1] - grid[0]) / PARTS, 1.0 - math.sqrt(0.5), run.semi
+    state = lambda t: dense_output.derivative(steps, values, float(t), 0)  # noqa: E731
+    high, fits = run.finer(float(grid[0]), state(grid[0])), looker(semi)
+    solve, misfit = _following(semi, high, steps, values, rates, gamma * h)
+    y, before = np.zeros((high.system.size, 2)), misfit(grid[0])
+    nothing, out = np.zeros(len(high.held)), [np.zeros((semi.n, semi.fields, 2))]
     with bar("times", PARTS * (len(grid) - 1)) as shown:
         for begin in grid[:-1]:
-            middle, left = float(begin) + 0.5 * PARTS * h, np.zeros(high.source.shape[0])
+            if run.timed.quasilinear and drifted(high, state(begin), float(begin)):
+                high = run.finer(float(begin), state(begin))
+                solve, misfit = _following(semi, high, steps, values, rates, gamma * h)
+                before = misfit(begin)
+            system, middle, left = high.system, float(begin) + 0.5 * PARTS * h, np.zeros(high.source.shape[0])
             if fits is not None:  # rows of all orders miss what jumps between the particles
                 u, rate = (dense_output.derivative(steps, values, middle, j) for j in range(2))
                 left = high.source.host @ left_between(semi, fits, u, [rate], middle)
@@ -102,13 +105,17 @@ def _integrated(
     return space, time
 
 
-def _around(semi: Semidiscrete, high: Semidiscrete, steps: Any, values: Any, g: float) -> Callable[..., np.ndarray]:
-    """Solves (E + g (A + B N'(u))) y = r (n, m) at a time: errors go on as small changes of the run do."""
+def _following(
+    semi: Semidiscrete, high: Semidiscrete, steps: Any, values: Any, rates: Any, g: float
+) -> tuple[Callable[..., np.ndarray], Callable[[float], np.ndarray]]:
+    """What solves (E + g (A + B N'(u))) y = r (n, m) at a time, for errors go on as small changes of the run do; and
+    what its states leave over."""
+    misfit = lambda t: _misfit(semi, high, steps, values, rates, float(t))  # noqa: E731
     if semi.linear:
         solve = high.system.resolvent(g).solve
-        return lambda r, t: solve(r)
+        return lambda r, t: solve(r), misfit
     newton = Newton(high)
-    return lambda r, t: newton.around(r, dense_output.derivative(steps, values, float(t), 0), float(t), g)
+    return lambda r, t: newton.around(r, dense_output.derivative(steps, values, float(t), 0), float(t), g), misfit
 
 
 def _mean(

@@ -123,8 +123,8 @@ def evolve(
     ------
     ValueError
         For bad input, and for problems that this cannot do: pure advection, conditions nonlinear in u; with several
-        regions, nonlinear equations and second order in time; with ``readapt`` nonlinear highest derivatives, second
-        order in time, incompressible flows, several regions, a user's stencils, and whatever is traced by JAX.
+        regions, nonlinear equations and second order in time; with ``readapt`` second order in time, incompressible
+        flows, several regions, a user's stencils, and whatever is traced by JAX.
     SolveError
         For a run that blew up, a stage that did not converge, steps that became too small.
 

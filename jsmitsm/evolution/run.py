@@ -45,7 +45,7 @@ class Run:
         self.told: list[str] = []
         self.counts: dict[str, Any] = {"steps": 0, "rejected": 0, "pencils": 0}
         self.newton: Newton | None = None
-        self._fits: Any = None
+        self._fits: dict[int, Any] = {}  # by order
         self.name = self._scheme(scheme)
         self.damping = self._damping(damping)
         self.semi = self.pencil(t[0] if is_traced(t[0]) else np.asarray(float(t[0])), start[0])
@@ -123,25 +123,9 @@ class Run:
     def pencil(self, t: Any, u: Any) -> Semidiscrete:
         """The semidiscrete equations, linearised at the values u (N, F) where the problem is quasilinear."""
         timed, began = self.timed, time.perf_counter()
-        problem = timed.at(t, self.params)
         self.counts["pencils"] += 1
-        options: dict[str, Any] = {
-            "order": self.order, "mass": timed.sourced, "stencils": self.stencils, "depth": self.depth
-        }  # fmt: skip
-        reference = None
-        if not timed.quasilinear:
-            with computed():
-                pencil = assemble_pencil(problem, self.cloud, **options)
-        else:
-            problem.pde = timed.space  # type: ignore[assignment]
-            taylor = self._expansions(problem, u)
-            pencil = assemble_pencil(problem, self.cloud, taylor=taylor, **options)
-            rec = pencil.layout.disc.rec
-            slots = slot_series(rec, timed.space.slots, taylor, 0)
-            jac, _ = timed.space.coefficients(self.cloud.points, 0, params=problem.params, slots=slots)
-            xp = jnp if is_traced(jac) else np
-            reference = xp.broadcast_to(jac[:, :, 0], (self.fields, len(timed.space.slots), len(self.cloud)))
-        semi = Semidiscrete(timed, pencil, self.params, self.damping, reference)
+        semi = self._semidiscrete(t, u, self.order, self.damping, timed.sourced, self.stencils)
+        pencil = semi.pencil
         if not self.traced:
             refuse_convection(semi, self.flags)
             if timed.flow is not None:
@@ -167,18 +151,27 @@ class Run:
                     "evolution may be unstable.")  # fmt: skip
             self.flags += [] if flag in self.flags else [flag]
 
-    def finer(self) -> Semidiscrete:
-        """The semidiscrete equations of two orders more, as they are at the start."""
-        problem = self.timed.at(np.asarray(float(self.t[0])), self.params)
-        pencil = assemble_pencil(problem, self.cloud, order=self.order + 2, depth=self.depth)
-        return Semidiscrete(self.timed, pencil, self.params, 0.0)
+    def finer(self, t: float, u: Any) -> Semidiscrete:
+        """The semidiscrete equations of two orders more, at a time and values (N, F)."""
+        return self._semidiscrete(np.asarray(t), u, self.order + 2, 0.0, None, None)
 
-    def _expansions(self, problem: Any, u: Any) -> Any:
-        """Local polynomials (N, F, K) of the values a problem is linearised at."""
-        if self._fits is None:
-            disc = discretize(problem, self.cloud, "S", self.order, None, self.stencils, None, depth=self.depth)
-            self._fits = local_fits(disc, disc.rec.reach)
-        return self._fits.coefficients(u)
+    def _semidiscrete(self, t: Any, u: Any, order: int, damping: float, massed: Any, stencils: Any) -> Semidiscrete:
+        timed, problem = self.timed, self.timed.at(t, self.params)
+        options: dict[str, Any] = {"order": order, "mass": massed, "stencils": stencils, "depth": self.depth}
+        if not timed.quasilinear:
+            with computed():
+                return Semidiscrete(timed, assemble_pencil(problem, self.cloud, **options), self.params, damping)
+        problem.pde = timed.space  # type: ignore[assignment]
+        if order not in self._fits:
+            disc = discretize(problem, self.cloud, "S", order, None, stencils, None, depth=self.depth)
+            self._fits[order] = local_fits(disc, disc.rec.reach)
+        taylor = self._fits[order].coefficients(u)  # of the values the problem is linearised at, (N, F, K)
+        pencil = assemble_pencil(problem, self.cloud, taylor=taylor, **options)
+        slots = slot_series(pencil.layout.disc.rec, timed.space.slots, taylor, 0)
+        jac, _ = timed.space.coefficients(self.cloud.points, 0, params=problem.params, slots=slots)
+        xp = jnp if is_traced(jac) else np
+        reference = xp.broadcast_to(jac[:, :, 0], (self.fields, len(timed.space.slots), len(self.cloud)))
+        return Semidiscrete(timed, pencil, self.params, damping, reference)
 
     def renew(self, y: Any, t: Any) -> None:
         """The pencil linearised at a later state."""

@@ -153,3 +153,28 @@ def test_what_jumps_between_the_particles(name, n):
     run = js.evolve(js.Problem(pde, bcs), js.interval(0.0, 1.0, n), start, t=(0.0, end), tol=1e-6)
     error = np.abs(run.u[-1] - exact(run.cloud.points[:, 0])).max()
     assert 0.5 < run.error_estimate()[-1].max() / error < 15.0
+
+
+OPERATORS = {
+    "1 + u": lambda u, x, t: js.divergence(lambda y: (1.0 + u(y)) * js.grad(u)(y))(x),
+    "1 + u^2, a reaction": lambda u, x, t: js.divergence(lambda y: (1.0 + u(y) ** 2) * js.grad(u)(y))(x) + 3.0 * u(x),
+    "in time": lambda u, x, t: (1.0 + jnp.sin(5.0 * t)) * js.laplacian(u)(x),
+    "in time and space": lambda u, x, t: js.divergence(
+        lambda y: (1.0 + 0.5 * jnp.sin(5.0 * t) * y[0]) * js.grad(u)(y)
+    )(x),
+}
+
+
+@pytest.mark.parametrize("name", OPERATORS)
+@pytest.mark.parametrize("order", [4, 6])
+def test_highest_derivatives_that_change(name, order):
+    """The pencil of two orders more changes as that of the run does."""
+    exact, op = lambda x, t: 1.5 + jnp.sin(6.0 * x[0]) * jnp.cos(3.0 * t), OPERATORS[name]
+    problem = js.Problem(
+        lambda u, x, t: js.dt(u)(x) - op(u, x, t) - jax.grad(exact, 1)(x, t) + op(lambda y: exact(y, t), x, t),
+        {"left": js.dirichlet(exact), "right": js.dirichlet(exact)},
+    )
+    cloud = js.interval(0.0, 1.0, 23)
+    run = js.evolve(problem, cloud, lambda x: exact(x, 0.0), t=(0.0, 0.5), steps=60, order=order)
+    error = np.abs(run.u[-1] - np.asarray(jax.vmap(exact, (0, None))(cloud.points, 0.5))).max()
+    assert error > 1e-7 and 0.4 * error < float(run.error_estimate()[-1].max()) < 3 * error

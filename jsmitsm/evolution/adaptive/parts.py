@@ -202,11 +202,6 @@ class Marcher:
 
 def refuse_what_does_not_damp(made: Timed) -> None:
     """ValueError for problems whose clouds cannot be made by an estimate."""
-    if made.quasilinear:
-        raise ValueError(
-            "readapt: the error in space of problems whose highest derivatives are nonlinear, or have coefficients "
-            "that depend on t, is not estimated, and no cloud can be made by it; leave readapt out"
-        )
     if made.masses[1].slots or made.flow is not None:
         what = "of second order in time" if made.masses[1].slots else "incompressible flows"
         raise ValueError(

@@ -31,17 +31,17 @@ class RegionsRun(Run):
         massed = np.any([part.sourced for part in self.timed.parts.values()], axis=0)
         self.counts["pencils"] += 1
         with computed():
-            semi = self._semidiscrete(t, self.order, massed, self.stencils)
+            semi = self._parts(t, self.order, massed, self.stencils)
         if not self.traced:
             self._refuse_convection()
         self.told = list(semi.pencil.health)
         self.counts["seconds in pencils"] = self.counts.get("seconds in pencils", 0.0) + time.perf_counter() - began
         return semi
 
-    def finer(self) -> RegionsSemidiscrete:
-        return self._semidiscrete(np.asarray(float(self.t[0])), self.order + 2, None, None)
+    def finer(self, t: float, u: Any) -> RegionsSemidiscrete:
+        return self._parts(np.asarray(t), self.order + 2, None, None)
 
-    def _semidiscrete(self, t: Any, order: int, massed: Any, stencils: Any) -> RegionsSemidiscrete:
+    def _parts(self, t: Any, order: int, massed: Any, stencils: Any) -> RegionsSemidiscrete:
         problem = self.timed.at(t, self.params)
         pencil = assemble_regions_pencil(
             problem, self.cloud, order=order, mass=massed, stencils=stencils, depth=self.depth
