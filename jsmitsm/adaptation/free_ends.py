@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from jsmitsm.adaptation.edges import turns
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.equation.problem import Problem
+from jsmitsm.solution.look.edges import turns
 
 # The error beside such a point in parts of what the values around it are from a plane. Measured on r^(1/2) between
 # held and free, and on r^(2/3) between two free sides: 0.2 to 0.45; as much as 2 where the point is not a particle.

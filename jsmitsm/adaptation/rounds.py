@@ -9,7 +9,6 @@ import numpy as np
 
 from jsmitsm.adaptation import growth
 from jsmitsm.adaptation.data import Data, data_of
-from jsmitsm.adaptation.edges import edges
 from jsmitsm.adaptation.first_cloud import Make, farther_than_asked, looked_at, made
 from jsmitsm.adaptation.free_ends import off_at_free_ends
 from jsmitsm.adaptation.layers import LOST, along_outflow
@@ -21,6 +20,7 @@ from jsmitsm.adaptation.witness import Earlier, doubted, remembered, stands_out,
 from jsmitsm.cloud.cloud import Cloud
 from jsmitsm.equation.problem import Problem
 from jsmitsm.runtime.errors import SolveError, TooCoarse, TooFine
+from jsmitsm.solution.look.edges import edges
 from jsmitsm.solution.look.gaps import gaps
 from jsmitsm.solution.solution import Solution
 from jsmitsm.solution.solve import solve

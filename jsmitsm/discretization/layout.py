@@ -15,7 +15,7 @@ from jsmitsm.cloud.regions.region_cloud import RegionCloud
 from jsmitsm.cloud.sight.walls import Walls, seen
 from jsmitsm.discretization.parts.whole import Part
 from jsmitsm.discretization.periodic import Images, periodic_images, with_corners
-from jsmitsm.discretization.resolution.digits import room, suited_depth, warn_of_float32
+from jsmitsm.discretization.resolution.digits import carries, room, suited_depth, warn_of_float32
 from jsmitsm.discretization.supports import check_supports, cut_off, default_kernel, find_stencils, walls_of
 from jsmitsm.equation.branches import FIELD
 from jsmitsm.equation.closing import closed
@@ -132,10 +132,11 @@ def discretize(
     if depth == "auto":
         held = [g.ids for g in groups if g.held]
         depth = suited_depth(method, rec, flat, sourced, traced, cloud, problem.params, held, part)
-        depth = depth and min(depth, room(rec, order, traced, cloud, problem.params, part))
+        depth = depth and min(depth, room(rec, order))
     rec = recursion(cloud.dim, order, problem.fields, traced.slots, traced.pattern, traced.order, int(depth))
     scheme = _scheme(method, rec, traced, problem, cloud, basis_terms)
-    scheme = replace(scheme, **_conditions_layout(groups, rec), sourced=sourced, flat=flat)
+    carried = method == "S" and bool(depth) and carries(rec, traced, cloud, problem.params, part)
+    scheme = replace(scheme, **_conditions_layout(groups, rec), sourced=sourced, flat=flat, carried=carried)
     if scheme.n_data and method in ("I", "II", "III"):
         raise ValueError(
             f"method: {method} takes one condition where values are held, but a boundary has more (as a clamped "

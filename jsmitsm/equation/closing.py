@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from jsmitsm.equation.bcs import Condition
+from jsmitsm.equation.field import RATE
 from jsmitsm.equation.problem import Problem, of_parts
 from jsmitsm.equation.traced import Traced
 from jsmitsm.equation.tracing import trace
@@ -63,7 +64,7 @@ def recorded_values(function: Callable[..., Any], dim: int, params: Any, compone
 def recorded_residual(residual: Callable[..., Any], dim: int, problem: Problem, where: str) -> Traced:
     arguments = "u, x, n" if problem.params is None else "u, x, n, params"
     with _named(where, f"residual({arguments}) returning a scalar or a vector"):
-        return trace(residual, dim, problem.fields, extras=((dim,),), params=problem.params)
+        return _without_rates(trace(residual, dim, problem.fields, extras=((dim,),), params=problem.params), where)
 
 
 def recorded_between(residual: Callable[..., Any], dim: int, problem: Problem, where: str) -> Traced:
@@ -76,7 +77,19 @@ def recorded_between(residual: Callable[..., Any], dim: int, problem: Problem, w
 
     arguments = "a, b, x, n" if problem.params is None else "a, b, x, n, params"
     with _named(where, f"residual({arguments}) returning a scalar or a vector"):
-        return trace(both, dim, 2 * fields, extras=((dim,),), params=problem.params)
+        return _without_rates(trace(both, dim, 2 * fields, extras=((dim,),), params=problem.params), where)
+
+
+def _without_rates(record: Traced, where: str) -> Traced:
+    """The record of a condition; ValueError where it asks for a rate, of which rows of conditions know nothing."""
+    if any(k >= RATE for k, _ in record.slots):
+        raise ValueError(
+            f"{where}: js.dt(u) in a condition, which takes no rates: a steady problem has none, and in js.evolve, "
+            "where the pde says what the rate is, give that a field v of its own, v(x) - js.laplacian(u)(x) = 0 for "
+            "the heat equation, and write v(x) in the condition; waves leave through a layer, with s(x) * js.dt(u)(x) "
+            "in the pde (docs: time)"
+        )
+    return record
 
 
 @contextmanager

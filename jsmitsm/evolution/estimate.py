@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from jsmitsm.evolution.run import Run, drifted
+from jsmitsm.evolution.sizes import scales
 from jsmitsm.evolution.space.semidiscrete import Semidiscrete
 from jsmitsm.evolution.space.system import System
 from jsmitsm.evolution.steps import dense_output
@@ -18,6 +19,7 @@ from jsmitsm.evolution.steps.stepping import RadauStepper, Stepper
 from jsmitsm.evolution.steps.tableaux import KENCARP4, RADAU
 from jsmitsm.evolution.unseen import left_between, looker
 from jsmitsm.runtime.progress import PENCIL, bar
+from jsmitsm.solution.estimate import lower
 from jsmitsm.taylor.multi_indices import HIGHEST
 
 # So many times are looked at. From one to the next the error goes in so many parts, in each of which the misfit is
@@ -34,41 +36,67 @@ def in_space(
 
     Dashes are of order p + 2. What the rates leave over drives the error, from zero at the start. history: times and
     values of the steps; rates: theirs, of second order in time. Zero where nothing is known: at the highest orders.
-    The third is where the errors of steps, lumps (size,) at times, have gone on the way, where that is known.
+    The third is where the errors of steps, lumps (size,) at times, have gone on the way, where that is known. Where
+    order p + 2 makes more of the error than there is of the solution, it is p + 1 or a lower order, if that does not:
+    on some clouds the higher pencil has a growing mode, of which the run knows nothing.
     """
     semi, (steps, values) = run.semi, history
     if len(steps) < 2 or run.order + 2 > HIGHEST:
         return steps[[0, -1]], *np.zeros((2, 2, semi.n, semi.fields))
     grid = np.linspace(steps[0], steps[-1], min(LOOKS, len(steps) - 1) + 1)
-    # Pairs of fields that drive one another are the ones that are damped.
-    if semi.second or run.damping:
-        integrated = _travelled if semi.second else _summed
-        errors = integrated(semi, run.finer(float(steps[0]), values[0]), steps, values, rates, grid)
-        carried = np.zeros_like(errors)
-    else:
-        errors, carried = _integrated(run, steps, values, rates, grid, lumps)
+    scale = scales(semi, np.abs(values).max(axis=(0, 1)))
+    errors, carried = _towards(run, run.order + 2, steps, values, rates, grid, lumps)
+    if not _within(errors, carried, scale):
+        below = lower(run.order, semi.timed.order)
+        for order in (run.order + 1, *([below] if below < run.order else [])):
+            other = _towards(run, order, steps, values, rates, grid, lumps)
+            if _within(*other, scale):
+                errors, carried = other
+                break
     for each in (errors, carried):
         each.reshape(len(grid), -1)[:, semi.held] = 0.0
     return grid, errors, carried
 
 
+def _within(errors: np.ndarray, carried: np.ndarray, scale: np.ndarray) -> bool:
+    """Whether errors (K + 1, N, F) are smaller than the solution."""
+    return bool((np.maximum(np.abs(errors), np.abs(carried)).max(axis=(0, 1)) <= scale).all())
+
+
+def _towards(
+    run: Run, order: int, steps: Any, values: Any, rates: Any, grid: np.ndarray, lumps: list[tuple[float, np.ndarray]]
+) -> tuple[np.ndarray, np.ndarray]:
+    """The errors in space and in time (K + 1, N, F) by the equations of an order."""
+    # Pairs of fields that drive one another are the ones that are damped.
+    if run.semi.second or run.damping:
+        integrated = _travelled if run.semi.second else _summed
+        errors = integrated(run.semi, run.beside(order, float(steps[0]), values[0]), steps, values, rates, grid)
+        return errors, np.zeros_like(errors)
+    return _integrated(run, order, steps, values, rates, grid, lumps)
+
+
 def estimated(
-    run: Run, times: np.ndarray, grid: np.ndarray, errors: np.ndarray, carried: np.ndarray, in_time: np.ndarray
-) -> np.ndarray:
+    run: Run, times: np.ndarray, grid: np.ndarray, errors: np.ndarray, carried: np.ndarray, in_time: np.ndarray,
+    scale: np.ndarray,
+) -> np.ndarray:  # fmt: skip
     """The sizes of errors (S, N, F) at the times: of those in space at a grid, and of what steps add.
 
-    carried: that, at the grid, where it is known where it has gone; in_time (S,): how much of it is known to be there.
+    carried: that, at the grid, where it is known where it has gone; in_time (S, F): how much of it is known to be
+    there, of fields of a scale (F,). Where the sum of steps' errors does not know how fields drive one another, all are
+    taken to be off by the same part of themselves.
     """
+    if run.semi.second or run.damping or not run.semi.linear:
+        in_time = (in_time / scale).max(axis=1, keepdims=True) * scale
     index = np.clip(np.searchsorted(grid, times), 1, len(grid) - 1)
     part = ((times - grid[index - 1]) / np.maximum(grid[index] - grid[index - 1], 1e-300))[:, None, None]
     space, steps = ((1.0 - part) * e[index - 1] + part * e[index] for e in (np.abs(errors), np.abs(carried)))
-    out = space + np.maximum(steps, in_time[:, None, None])
+    out = space + np.maximum(steps, in_time[:, None, :])
     out.reshape(len(times), -1)[1:, run.semi.held] = 0.0
     return out
 
 
 def _integrated(
-    run: Run, steps: Any, values: Any, rates: Any, grid: np.ndarray, lumps: list[tuple[float, np.ndarray]]
+    run: Run, order: int, steps: Any, values: Any, rates: Any, grid: np.ndarray, lumps: list[tuple[float, np.ndarray]]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Errors (K + 1, N, F) in space and in time at equidistant times: E e' + A e + B N'(u) e = misfit, from e = 0.
 
@@ -78,14 +106,14 @@ def _integrated(
     """
     h, gamma, semi = float(grid[1] - grid[0]) / PARTS, 1.0 - math.sqrt(0.5), run.semi
     state = lambda t: dense_output.derivative(steps, values, float(t), 0)  # noqa: E731
-    high, fits = run.finer(float(grid[0]), state(grid[0])), looker(semi)
+    high, fits = run.beside(order, float(grid[0]), state(grid[0])), looker(semi, grid)
     solve, misfit = _following(semi, high, steps, values, rates, gamma * h)
     y, before = np.zeros((high.system.size, 2)), misfit(grid[0])
     nothing, out = np.zeros(len(high.held)), [np.zeros((semi.n, semi.fields, 2))]
     with bar("times", PARTS * (len(grid) - 1)) as shown:
         for begin in grid[:-1]:
             if run.timed.quasilinear and drifted(high, state(begin), float(begin)):
-                high = run.finer(float(begin), state(begin))
+                high = run.beside(order, float(begin), state(begin))
                 solve, misfit = _following(semi, high, steps, values, rates, gamma * h)
                 before = misfit(begin)
             system, middle, left = high.system, float(begin) + 0.5 * PARTS * h, np.zeros(high.source.shape[0])
@@ -142,7 +170,7 @@ def _travelled(
     many = -(-(len(steps) - 1) // (len(grid) - 1))
     h = float(grid[1] - grid[0]) / many
     scheme = RADAU if semi.linear else KENCARP4
-    left = _LeftOver(high.system, lambda t: _misfit(semi, high, steps, values, rates, t), scheme.nodes)
+    left = _LeftOver(high.system, _missed(semi, high, steps, values, rates, grid), scheme.nodes)
 
     def driven(y: np.ndarray, t: float, known: Any) -> np.ndarray:
         slope = high.linearised(high.steepness(dense_output.derivative(steps, values, t, 0), t))
@@ -183,11 +211,29 @@ def _summed(
     step of the run, it takes out what turns too fast to add up.
     """
     solve, sizes = high.system.resolvent(float(np.diff(steps).mean())).solve, []
+    missed = _missed(semi, high, steps, values, rates, grid)
     for t in grid:
-        found = high.placed(solve(_misfit(semi, high, steps, values, rates, float(t))), np.zeros(len(high.held)))
+        found = high.placed(solve(missed(float(t))), np.zeros(len(high.held)))
         sizes.append(np.broadcast_to(np.linalg.norm(found, axis=1, keepdims=True), found.shape))
     between = (grid[1] - grid[0]) * (np.array(sizes[1:]) + np.array(sizes[:-1])) / 2
     return np.concatenate([np.zeros_like(between[:1]), np.cumsum(between, axis=0)])
+
+
+def _missed(
+    semi: Semidiscrete, high: Semidiscrete, steps: Any, values: Any, rates: Any, grid: np.ndarray
+) -> Callable[[float], np.ndarray]:
+    """What states leave over at a time, without what jumps between the particles, which rows of all orders miss."""
+    fits = looker(semi, grid)
+
+    def missed(t: float) -> np.ndarray:
+        found = _misfit(semi, high, steps, values, rates, t)
+        if fits is None:
+            return found
+        u, first = (dense_output.derivative(steps, values, t, j) for j in range(2))
+        moved = [first] if rates is None else [dense_output.derivative(steps, rates, t, j) for j in range(2)]
+        return found - high.source.host @ left_between(semi, fits, u, moved, t)
+
+    return missed
 
 
 def _misfit(semi: Semidiscrete, high: Semidiscrete, steps: Any, values: Any, rates: Any, t: float) -> np.ndarray:

@@ -188,8 +188,10 @@ class Evolution(Copied):
     def error_estimate(self) -> Array:
         """Estimated error at every particle and saved time.
 
-        In space by the defect that a pencil of order p + 2 finds, in time by the embedded scheme. Computed when asked;
-        from then on an error above 2 % of the solution is a flag.
+        In space by the defect that a pencil of order p + 2 finds, in time by what the scheme says of its steps, and the
+        interpolation of states between them. Computed when asked; from then on an error above 2 % of the solution is
+        a flag, that of a field by its own size. Where order p + 2 makes more of it than there is of the solution,
+        another order is asked.
 
         Returns
         -------

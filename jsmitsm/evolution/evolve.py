@@ -86,7 +86,7 @@ def evolve(
     steps : int, optional
         So many equal steps; or
     tol : float, optional
-        Steps whose estimated error, relative to the largest value so far, stays below it.
+        Steps whose estimated error stays below it, that of each field relative to its own largest value so far.
     order : int
         Of the discretization in space, the degree of the fits.
     scheme : {"auto", "esdirk", "radau", "imex", "euler"}

@@ -11,11 +11,13 @@ import numpy as np
 from jsmitsm.evolution.estimate import estimated, in_space
 from jsmitsm.evolution.evolution import Evolution, Report
 from jsmitsm.evolution.run import Run
+from jsmitsm.evolution.sizes import Sizes, sizes
 from jsmitsm.evolution.space.system import VANISHING
 from jsmitsm.evolution.steps import dense_output
 from jsmitsm.evolution.steps.control import FIRST, controlled
 from jsmitsm.evolution.steps.in_time import InTime, looks
 from jsmitsm.evolution.steps.stepping import Step, Stopped
+from jsmitsm.evolution.unseen import made_at_seams
 from jsmitsm.runtime.errors import SolveError
 from jsmitsm.solution.fit import Recipe
 from jsmitsm.taylor.multi_indices import HIGHEST
@@ -43,13 +45,14 @@ class History:
         self.times: list[float] = []
         self.states: list[np.ndarray] = []
         self.rates: list[np.ndarray] = []
-        self.scale, self.first = 0.0, 0.0
-        self.in_time = InTime(*(float(v) for v in run.t))
+        self.sizes, self.first = Sizes(run), 0.0
+        lasting = bool(run.second or run.damping)
+        self.in_time = InTime(float(run.t[0]), float(run.t[1]), lambda part: sizes(run.semi, part), lasting)
 
     def add(self, t: float, step: Step, number: int | None = None) -> None:
         semi = self.run.semi
         part = step.y[: semi.system.n]
-        self.scale = max(self.scale, semi.system.largest(part))
+        self.sizes.add(step.y)
         if self.wanted is not None and number is not None and not self.wanted[number]:
             return
         self.times.append(t)
@@ -59,6 +62,17 @@ class History:
         if semi.second:
             rates = semi.sample(np.asarray(float(t)))[3]
             self.rates.append(semi.kept(step.y[semi.system.n :], np.asarray(rates)))
+
+    def in_time_at(self, times: np.ndarray) -> np.ndarray:
+        """The estimated errors in time of the fields (S, F): of the steps, and of what lies between them."""
+        if not self.in_time.times:  # of a scheme without an estimate
+            return self.in_time.at(times)
+        between = dense_output.doubts(np.array(self.times), self.states, times, self.run.semi.system.largest)
+        return self.in_time.at(times) + between
+
+    def part_in_time(self, later: np.ndarray) -> float | None:
+        """Of these the worst, as a part of its field."""
+        return float((later / self.sizes.scales()).max()) if self.in_time.times else None
 
     def at(self, times: np.ndarray, of: list[np.ndarray]) -> np.ndarray:
         index, weights = dense_output.weights(np.array(self.times), times)
@@ -134,6 +148,7 @@ def _equal(run: Run, y: np.ndarray, times: np.ndarray, history: History, shown: 
             run.renew(step.y, float(times[k]))
             stepper = run.stepper(run.semi)
             step = stepper.first(step.y, float(times[k]))
+        history.sizes.stepped(stepper.smallest(h))
         step = _one(run, stepper, step, float(times[k]), h, k in wanted)
         _refuse_growth(history, run.semi.system.largest(step.y[: run.semi.system.n]), float(times[k + 1]))
         history.add(float(times[k + 1]), step, k + 1)
@@ -158,10 +173,6 @@ def _refuse_growth(history: History, size: float, t: float) -> None:
         )
 
 
-def _size(run: Run, error: np.ndarray, scale: float) -> float:
-    return run.semi.system.largest(error[: run.semi.system.n]) / (scale or 1.0)
-
-
 def _adaptive(run: Run, y: np.ndarray, t0: float, t1: float, tol: float, history: History, shown: Any) -> None:
     if run.name == "euler":
         raise ValueError('tol: backward Euler has no estimate of its error; use steps, or scheme="esdirk"')
@@ -180,27 +191,42 @@ def _adaptive(run: Run, y: np.ndarray, t0: float, t1: float, tol: float, history
             history.in_time.add(stepper.inner, step, t, stepper.h)
         history.add(t, step)
 
-    foreseen = _foreseen(run, stepper.inner, t0, t1)
-    least = foreseen if run.semi.system.largest(y) < _REST * foreseen else 0.0
-    counts = controlled(
-        stepper, y, t0, t1, tol, added, tell,
-        lambda error: _size(run, error, max(history.scale, least)), FIRST if least else 0,
-    )  # fmt: skip
+    foreseen = _foreseen(run, stepper.inner, y, t0, t1)
+    known, n = sizes(run.semi, y[: run.semi.system.n]), run.semi.system.n
+    driven, coupled = foreseen
+    least = np.where(known < _REST * np.maximum(driven, coupled), np.maximum(driven, coupled), 0.0)
+
+    def size(error: np.ndarray) -> float:
+        """That of the worst field. What others make of one may be all of it, so that the step itself counts."""
+        history.sizes.stepped(stepper.inner.smallest(stepper.h))
+        more = least if run.fields == 1 else np.maximum(least, sizes(run.semi, stepper.y[:n]))
+        return float((sizes(run.semi, error[:n]) / history.sizes.scales(more, tol)).max())
+
+    resting = known < _REST * driven  # data that do not change are not passed over
+    rests = bool(resting.any() and (resting | (known == 0)).all() if run.semi.timed.steady else resting.any())
+    counts = controlled(stepper, y, t0, t1, tol, added, tell, size, FIRST if rests else 0)
     run.counts.update(counts)
 
 
-def _foreseen(run: Run, stepper: Any, t0: float, t1: float) -> float:
-    """How large data make a solution that starts at rest: the values given, and what forces do in one of the parts.
+def _foreseen(run: Run, stepper: Any, y: np.ndarray, t0: float, t1: float) -> tuple[np.ndarray, np.ndarray]:
+    """How large data make each field (F,) of a solution that starts at rest, and how large other fields make it.
 
-    What begins slowly, as a smooth pulse does, would have to be right to so many digits of nearly nothing.
+    The values given, and what forces do in one of the parts. What begins slowly, as a smooth pulse does, would have to
+    be right to so many digits of nearly nothing.
     """
-    system = run.semi.system
-    h, size = stepper.smallest((t1 - t0) / _PARTS), 0.0
-    for t in np.linspace(t0, t1, 1 if run.semi.timed.steady else _PARTS + 1):
+    semi, system = run.semi, run.semi.system
+    h, size = stepper.smallest((t1 - t0) / _PARTS), np.zeros(run.fields)
+    held = semi.held % run.fields
+    for t in np.linspace(t0, t1, 1 if semi.timed.steady else _PARTS + 1):
         force, _, known = stepper.drive.start(float(t))
         moved = system.resolvent(h).solve(h * np.asarray(force))[: system.n]
-        size = max(size, system.largest(moved), system.largest(np.asarray(known)))
-    return size if np.isfinite(size) else 0.0
+        given = [system.largest(np.asarray(known)[held == k]) for k in range(run.fields)]
+        size = np.maximum(size, np.maximum(sizes(semi, moved), given))
+    coupled = np.zeros(run.fields)
+    if run.fields > 1:
+        first = _now(semi, t0, y)[0]
+        coupled = sizes(semi, system.resolvent(h).solve(system.mass(y) + h * first)[: system.n])
+    return np.where(np.isfinite(size), size, 0.0), np.where(np.isfinite(coupled), coupled, 0.0)
 
 
 class _Renewing:
@@ -208,7 +234,7 @@ class _Renewing:
 
     def __init__(self, run: Run):
         self.run, self.inner = run, run.stepper(run.semi)
-        self.order, self.h = self.inner.order, 0.0
+        self.order, self.h, self.y = self.inner.order, 0.0, np.zeros(0)
 
     def first(self, y: np.ndarray, t: float) -> Step:
         return self.inner.first(y, t)
@@ -220,7 +246,9 @@ class _Renewing:
             self.inner = run.stepper(run.semi)
             last = self.inner.first(last.y, t)
         self.h = h
-        return self.inner.advance(last, t, h, estimate)
+        now = self.inner.advance(last, t, h, estimate)
+        self.y = now.y
+        return now
 
 
 def _finished(run: Run, parts: np.ndarray, history: History, fault: str, began: float) -> Evolution:
@@ -241,8 +269,8 @@ def _finished(run: Run, parts: np.ndarray, history: History, fault: str, began: 
     else:
         states = history.at(times, history.states)
         rates = history.at(times, history.rates) if run.second else None
-    later = history.in_time.at(times)
-    in_time = float(later.max()) / (history.scale or 1.0) if history.in_time.times else None
+    later = history.in_time_at(times)
+    in_time = history.part_in_time(later)
     if in_time is not None and in_time > LARGE:
         flags.append(f"The estimated error in time is {in_time:.0%} of the solution: take more steps, or a tol.")
     if run.unseen > LARGE:
@@ -257,14 +285,22 @@ def _finished(run: Run, parts: np.ndarray, history: History, fault: str, began: 
     kept = np.array(history.times), np.stack(history.states)
     moved = np.stack(history.rates) if history.rates else None
 
+    beyond = made_at_seams(run.semi, kept, moved)
+    made = 0.0 if beyond is None else float((sizes(run.semi, beyond) / history.sizes.scales()).max())
+    if made > LARGE:
+        flags.append(
+            f"The equation is not the same on both sides of a periodic pair, which makes {made:.0%} of the solution: "
+            "let the source and the coefficients repeat themselves, or refine there."
+        )
     lumps = list(history.in_time.parts.values())
     known = cache(lambda: in_space(run, kept, moved, lumps))
 
     def estimate() -> np.ndarray:
-        sampled = run.unseen * np.abs(states).reshape(len(states), -1).max(axis=1)
+        sampled = run.unseen * np.abs(states).max(axis=1)
         sampled[0] = 0.0  # at the particles the start is right
-        found = estimated(run, np.asarray(times), *known(), later + sampled)
-        part = float(found.max(initial=0.0)) / (history.scale or 1.0)
+        scale = history.sizes.scales()
+        found = estimated(run, np.asarray(times), *known(), later + sampled, scale)
+        part = float((found.max(axis=(0, 1), initial=0.0) / scale).max())
         if part > LARGE and not (in_time is not None and in_time > LARGE):
             flags.append(f"The estimated error is {part:.0%} of the solution: refine the cloud, or raise the order.")
         return found

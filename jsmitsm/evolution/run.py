@@ -151,9 +151,9 @@ class Run:
                     "evolution may be unstable.")  # fmt: skip
             self.flags += [] if flag in self.flags else [flag]
 
-    def finer(self, t: float, u: Any) -> Semidiscrete:
-        """The semidiscrete equations of two orders more, at a time and values (N, F)."""
-        return self._semidiscrete(np.asarray(t), u, self.order + 2, 0.0, None, None)
+    def beside(self, order: int, t: float, u: Any) -> Semidiscrete:
+        """The semidiscrete equations of another order, at a time and values (N, F)."""
+        return self._semidiscrete(np.asarray(t), u, order, 0.0, None, None)
 
     def _semidiscrete(self, t: Any, u: Any, order: int, damping: float, massed: Any, stencils: Any) -> Semidiscrete:
         timed, problem = self.timed, self.timed.at(t, self.params)

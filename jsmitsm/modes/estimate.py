@@ -11,6 +11,7 @@ from jsmitsm.discretization.layout import Discretization
 from jsmitsm.discretization.pencil.assemble import Pencil
 from jsmitsm.discretization.regions.layout import Regions
 from jsmitsm.discretization.resolution.residuals import residual
+from jsmitsm.modes.ends import at_ends
 from jsmitsm.modes.question import Question, assembled, reduced
 from jsmitsm.modes.spectrum import Pairs
 from jsmitsm.runtime.errors import SolveError
@@ -66,7 +67,8 @@ def unseen(question: Question, found: Pairs, mode: Callable[[int], Solution]) ->
 
     and where the mode is not smooth, at a corner or where conditions change, neighbours part by a gap there. The value
     is off by about its square (in parts of the largest |v|; measured on corners and changes of conditions, by 0.2 to 4
-    times that), as energies are: what two orders tell falls with another power of the spacing.
+    times that), as energies are: what two orders tell falls with another power of the spacing. Where not all is held
+    around, there is more (see ``ends``).
     """
     out, pencil = np.zeros(len(found.values)), question.pencil
     if isinstance(pencil.layout.disc, Regions):
@@ -77,6 +79,7 @@ def unseen(question: Question, found: Pairs, mode: Callable[[int], Solution]) ->
         parted, largest = gaps(sol), float(np.abs(values).max(initial=0.0))
         if parted is not None and max(disc.rec.orders) == 2 and largest > 0:
             out[k] = value * (float(parted.max(initial=0.0)) / largest) ** 2
+            out[k] = max(out[k], at_ends(question, found, int(k), sol))
         if not same_everywhere(disc):
             left = found.left[:, k]
             missed = left @ (pencil.B.host @ _left_between(sol, disc))[pencil.free]

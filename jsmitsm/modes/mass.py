@@ -15,6 +15,7 @@ from jsmitsm.discretization.pencil.assemble import Pencil
 from jsmitsm.discretization.pencil.fits import local_fits
 from jsmitsm.discretization.pencil.sparse import Sparse, product
 from jsmitsm.discretization.regions.rows import spread_values
+from jsmitsm.equation.field import RATE
 from jsmitsm.equation.problem import Problem
 from jsmitsm.equation.traced import Traced
 from jsmitsm.equation.tracing import trace
@@ -131,6 +132,8 @@ def _recorded(problem: Problem, cloud: Cloud, mass: Callable[..., Any]) -> Trace
         raise ValueError(f"mass: the operator returns {record.n_equations} value(s) for {problem.fields} equation(s)")
     if not record.linear or record.source != "zero" or not record.slots:
         raise ValueError("mass: an operator is linear in u and has no part without u; this one is not so")
+    if any(k >= RATE for k, _ in record.slots):
+        raise ValueError("mass: js.dt(u) is a rate in time, and an eigenproblem has no rates; write u(x) in its place")
     return record
 
 

@@ -47,6 +47,9 @@ class Question:
         out = np.inf
         for disc, ids in operators(self.pencil):
             number = 0.5 * np.pi / mean_spacing(disc)
+            if len({disc.traced.order[e] for e in np.flatnonzero(self.massed)}) > 1:
+                out = min(out, self._fastest(disc, ids, number))
+                continue
             for e in np.flatnonzero(self.massed):
                 m, size = _leading(disc.traced, int(e), disc)
                 if isinstance(self.weights, Traced):
@@ -55,6 +58,24 @@ class Question:
                     less, most = 0, float(np.abs(self.weights[ids, e]).max())
                 out = min(out, size * number ** (m - less) / most) if most else out
         return out
+
+    def _fastest(self, disc: Discretization, ids: Any, number: float) -> float:
+        """The largest value of a wave along an axis, of equations that only together have waves, as u_t = v has none.
+
+        number: of the wave, 2 pi over its length.
+        """
+        from scipy.linalg import eigvals
+
+        found = []
+        for axis in range(disc.rec.dim):
+            stiff = _symbol(disc.traced, disc, axis, number)
+            if isinstance(self.weights, Traced):
+                inert = _symbol(self.weights, disc, axis, number)
+            else:
+                inert = np.diag(np.median(self.weights[ids], axis=0) * self.massed).astype(complex)
+            values = np.abs(eigvals(stiff, inert))
+            found += [float(v) for v in values if np.isfinite(v)]
+        return max(found, default=np.inf)
 
     def poles(self) -> list[str]:
         """Of coefficients that are infinite between the particles: no estimate knows that modes have cusps there."""
@@ -66,6 +87,17 @@ def _leading(record: Traced, e: int, disc: Discretization) -> tuple[int, float]:
     jac, _ = record.coefficients(disc.cloud.points, 0, params=disc.problem.params)
     lead = [s for s, (_, b) in enumerate(record.slots) if sum(b) == record.order[e]]
     return record.order[e], float(np.median(np.abs(np.asarray(jac)[e, lead, 0]).max(axis=0)))
+
+
+def _symbol(record: Traced, disc: Discretization, axis: int, number: float) -> np.ndarray:
+    """What an operator (F, F) makes of waves along an axis, at the median of its coefficients."""
+    jac, _ = record.coefficients(disc.cloud.points, 0, params=disc.problem.params)
+    typical = np.median(np.asarray(jac)[:, :, 0], axis=2)  # (E, S)
+    out = np.zeros((len(typical), disc.rec.fields), complex)
+    for s, (field, b) in enumerate(record.slots):
+        if b[axis] == sum(b):
+            out[:, field] += typical[:, s] * (1j * number) ** b[axis]
+    return out
 
 
 def operators(pencil: Pencil) -> list[tuple[Discretization, Any]]:

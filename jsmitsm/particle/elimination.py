@@ -22,7 +22,14 @@ import numpy as np
 
 from jsmitsm.particle.polynomials import whitening
 from jsmitsm.particle.recursion import FitAndTail, Recursion, constraints, fit_and_tail, row_lifts, substitution
-from jsmitsm.particle.small_systems import definite_inverse, gram_matrix, independent, null_space, product
+from jsmitsm.particle.small_systems import (
+    definite_inverse,
+    gram_matrix,
+    independent,
+    null_space,
+    orthonormalising,
+    product,
+)
 from jsmitsm.taylor.multi_indices import Slot, factorial, multi_indices
 
 # The ridge of a deep equation, as a part of its square.
@@ -48,6 +55,7 @@ class Scheme:
         of one order are sums of homogeneous polynomials.
     lost : rows of the recursion that add nothing to the others, where the equation degenerates.
     uneven : whether the particles' neighbours are too unevenly spread for the fit to be drawn to the near ones.
+    carried : whether convection may outweigh diffusion between neighbours.
     """
 
     method: str
@@ -62,6 +70,7 @@ class Scheme:
     lost: int = 0
     flat: bool = False
     uneven: bool = False
+    carried: bool = False
 
     def with_own(self, count: int, lost: int) -> Scheme:
         """The scheme of particles with so many conditions of their own and rows that add nothing.
@@ -196,7 +205,10 @@ def _deepened(scheme: Scheme, matrix: Any, basis: Any, particular: Any) -> tuple
     extension = size[:, None] * product(spread, inverse) / unit
     made = Deep(particular, across, extension, place, (matrix.shape[1], matrix.shape[0]))
     tail = made.extended(-product(across, basis))
-    return _joined(basis, tail, place.low, place.high, matrix.shape[1]), made
+    whole = _joined(basis, tail, place.low, place.high, matrix.shape[1])
+    if scheme.carried:
+        whole = whole @ orthonormalising(_heights(scheme)[:, None] * whole)
+    return whole, made
 
 
 def _rows_of(matrix: Any, at: np.ndarray) -> Any:
@@ -217,6 +229,17 @@ def _joined(upper: Any, lower: Any, first: np.ndarray, second: np.ndarray, count
 def _row_lengths(matrix: Any, xp: Any) -> Any:
     """The lengths of the deep parts of rows of unit length; where they are only rounding, none of it counts."""
     return xp.sqrt(xp.maximum(xp.sum(matrix**2, axis=1), FAINT**2))
+
+
+def _heights(scheme: Scheme) -> np.ndarray:
+    """How high every monomial (F K,) is at the farthest neighbour.
+
+    Where convection is strong, all local solutions but those that it carries have tails that grow as the Peclet number
+    to the power of the depth, and a basis that mixes them leaves nothing of the others in the normal equations of the
+    fit. One that is orthonormal by these heights does: Peclet numbers of 1e4 do no harm then.
+    """
+    rec = scheme.rec
+    return np.tile([scheme.farthest ** sum(a) for a in multi_indices(rec.dim, rec.reach)], rec.fields)
 
 
 def _ridge(scheme: Scheme) -> float:
@@ -256,7 +279,8 @@ def unconstrained(scheme: Scheme) -> tuple[Scheme, Elimination]:
 
 def eliminate_on_host(scheme: Scheme, jac: np.ndarray, length: float = 1.0) -> Elimination:
     """``eliminate`` in numpy, where one elimination serves many particles; kept for later."""
-    bare = Scheme(scheme.method, scheme.rec, scheme.free, scheme.dependent, flat=scheme.flat, uneven=scheme.uneven)
+    bare = Scheme(scheme.method, scheme.rec, scheme.free, scheme.dependent, flat=scheme.flat, uneven=scheme.uneven,
+                  carried=scheme.carried)  # fmt: skip
     return _eliminated_once(bare, jac.tobytes(), jac.shape, jac.dtype.str, length)
 
 
@@ -305,6 +329,9 @@ def _deepened_on_host(
     whole[low], source[np.ix_(low, first)] = basis, particular
     whole[high], source[np.ix_(high, first)] = -extension @ (across @ basis), -extension @ (across @ particular)
     source[np.ix_(high, deeper)] = extension
+    if scheme.carried:
+        heights = _heights(scheme)[:, None]
+        whole = np.linalg.qr(heights * whole)[0] / heights
     return whole, source
 
 

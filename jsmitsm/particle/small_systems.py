@@ -57,6 +57,24 @@ def _null_space_jvp(primals, tangents):
     return (z, q), (dz, dq)
 
 
+def orthonormalising(columns: Any) -> Any:
+    """T (k, k) that makes ``columns @ T`` orthonormal, for columns (n, k) that span the space.
+
+    Modified Gram-Schmidt in plain jnp. What rests on the space alone does not change with T, so it is a constant to
+    derivatives.
+    """
+    n, k = columns.shape
+    start = jnp.concatenate([jax.lax.stop_gradient(columns), jnp.eye(k, dtype=columns.dtype)])
+
+    def step(j, work):
+        one = jax.lax.dynamic_index_in_dim(work, j, 1, keepdims=False)
+        one = one / jnp.sqrt(jnp.maximum(jnp.sum(one[:n] ** 2), jnp.finfo(one.dtype).tiny))
+        along = jnp.where(jnp.arange(k) > j, one[:n] @ work[:n], 0.0)
+        return jax.lax.dynamic_update_index_in_dim(work - jnp.outer(one, along), one, j, 1)
+
+    return jax.lax.fori_loop(0, k, step, start)[n:]
+
+
 def independent(matrix: Any, rank: int) -> Any:
     """Which ``rank`` rows of a matrix (r, k) span it, the largest first, as rows of the unit matrix (rank, r)."""
     rest = jax.lax.stop_gradient(matrix)

@@ -322,7 +322,7 @@ def _beside(fit: Fit, low: Discretization) -> int:
     host = concrete(fit.cloud.points)
     if host is None:
         return order + 2  # told where the stencils are made
-    most = room(low.rec, order + 2, low.traced, low.cloud, fit.problem.params)
+    most = room(low.rec, order + 2)
     return compared(order, low.rec.depth, most, max(low.rec.orders), lags(low.rec))
 
 
@@ -350,7 +350,7 @@ def _of_order(
     same = not is_traced(fit.cloud.points, fit.cloud.normals)
     cloud = fit.cloud if same else Cloud(np.asarray(host), low.cloud.groups, low.cloud.normals)
     if depth is None:
-        depth = min(low.rec.depth, room(low.rec, order, low.traced, cloud, fit.problem.params))
+        depth = min(low.rec.depth, room(low.rec, order))
     other = discretized(fit.problem, cloud, "S", order, depth=depth)
     other.cloud = fit.cloud
     taylor = fit.taylor

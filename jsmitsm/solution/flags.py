@@ -33,6 +33,7 @@ from jsmitsm.discretization.resolution.steepness import unseen as beyond_slopes
 from jsmitsm.discretization.rows import all_rows
 from jsmitsm.runtime.errors import some
 from jsmitsm.solution.look.between import beyond_kinks
+from jsmitsm.solution.look.reach import rough_ends
 from jsmitsm.solution.look.sizes import predicted, scales, share
 from jsmitsm.solution.look.told import CLEARED, data, out_of_reach, unseen
 
@@ -63,8 +64,6 @@ SQUARED = 1e-6
 ROUNDED = 1e-3
 # (k s)^(p+1) cells, with s the spacing: the phase error a wave gathers across the domain. By order, as above.
 PHASE = (0.9, 3.5)
-
-
 # Where the highest derivatives change their sign, a smooth solution has a smaller estimated error than this.
 TURNED = 1e-3
 # Waves of so few particles that their phase would be out so many times as far as is a doubt are in truth where two
@@ -163,7 +162,7 @@ def _cleared(run: Any, values: np.ndarray, found: dict[str, float], doubts: list
     if doubts or not measured or run.formulation == "lsq" or not disc.linear or disc.rec.fields > 1:
         return False
     limits = {**CLEAR, "wave": CLEAR_WAVE * PHASE[disc.rec.order > 3]}
-    if not all(found.get(name, 0.0) <= limit for name, limit in limits.items()):
+    if not all(found.get(name, 0.0) <= limit for name, limit in limits.items()) or rough_ends(run, values):
         return False
     beyond, every = beyond_kinks(run, values), whole(disc)
     return beyond is None or share(every.own(beyond), every.own(values), told=every) <= CLEARED

@@ -14,7 +14,6 @@ from benchmarks.adaptation import CASES
 from benchmarks.nist import reentrant
 from jsmitsm.adaptation import measure
 from jsmitsm.adaptation.data import data_of, unresolved
-from jsmitsm.adaptation.edges import edges
 from jsmitsm.adaptation.first_cloud import first_cloud
 from jsmitsm.adaptation.free_ends import off_at_free_ends
 from jsmitsm.adaptation.layers import along_outflow, layers
@@ -24,6 +23,7 @@ from jsmitsm.adaptation.rounds import Rounds
 from jsmitsm.adaptation.spacing_field import GROWTH, SpacingField
 from jsmitsm.adaptation.witness import Earlier, remembered, stands_out, unseen
 from jsmitsm.runtime.errors import SolveError
+from jsmitsm.solution.look.edges import edges
 
 CORNER = [(0, 0), (1, 0), (1, 1), (-1, 1), (-1, -1), (0, -1)]
 SQUARE = [(0, 0), (1, 0), (1, 1), (0, 1)]
@@ -587,9 +587,10 @@ def test_a_number_is_reached_on_two_clouds_at_least(name):
     exact = {"integral": 1 / 12 - 16 / np.pi**5 * np.sum(np.tanh(k * np.pi / 2) / k**5),
              "largest": 0.0736713532814}[name]  # fmt: skip
     quantity = {"integral": lambda s: s.integral(), "largest": lambda s: s.u.max()}[name]
-    found = js.adapt(problem, make, 1e-4, quantity=quantity, progress=False)
+    tol = {"integral": 1e-4, "largest": 5e-4}[name]
+    found = js.adapt(problem, make, tol, quantity=quantity, progress=False)
     assert found.reached and len(found.history["particles"]) > 1
-    assert abs(found.quantity / exact - 1) < 3e-4
+    assert abs(found.quantity / exact - 1) < 3 * tol
 
 
 def test_what_is_no_number_is_refused():

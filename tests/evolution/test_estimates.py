@@ -178,3 +178,162 @@ def test_highest_derivatives_that_change(name, order):
     run = js.evolve(problem, cloud, lambda x: exact(x, 0.0), t=(0.0, 0.5), steps=60, order=order)
     error = np.abs(run.u[-1] - np.asarray(jax.vmap(exact, (0, None))(cloud.points, 0.5))).max()
     assert error > 1e-7 and 0.4 * error < float(run.error_estimate()[-1].max()) < 3 * error
+
+
+HEAT = js.Problem(lambda u, x, t: js.dt(u)(x) - js.laplacian(u)(x), ENDS)
+
+
+def modes(parts):
+    """A start of half-waves, amplitudes by number, and what becomes of it."""
+    start = lambda x: sum(a * jnp.sin(k * jnp.pi * x[0]) for k, a in parts.items())
+    exact = lambda x, t: sum(a * np.exp(-((k * np.pi) ** 2) * t) * np.sin(k * np.pi * x) for k, a in parts.items())
+    return start, exact
+
+
+@pytest.mark.parametrize("order", [4, 6])
+@pytest.mark.parametrize("steps", [5, 20, 40])
+@pytest.mark.parametrize("name", ["shock", "two waves", "a faint one"])
+def test_states_between_the_steps(name, steps, order):
+    """What is over within the first step, of walls that are cold at once or of short waves, is not interpolated."""
+    odd = {k: 4 / (k * np.pi) for k in range(1, 400, 2)}
+    start, exact = modes({"shock": odd, "two waves": {1: 1.0, 8: 0.5}, "a faint one": {1: 1.0, 8: 0.01}}[name])
+    start = 1.0 if name == "shock" else start
+    run = js.evolve(HEAT, js.interval(0.0, 1.0, 41), start, t=(0.0, 0.2), steps=steps, order=order, save=100)
+    error = np.abs(run.u[1:] - np.stack([exact(run.cloud.points[:, 0], t) for t in run.t[1:]])).max(axis=1)
+    told = np.asarray(run.error_estimate()[1:]).max(axis=1)
+    seen = error > 1e-2 * error.max()
+    assert (told > error / 5)[seen].all() and told.max() < 5 * error.max()
+    assert any("The estimated error in time" in flag for flag in run.flags) == (error.max() > 0.02)
+
+
+@pytest.mark.parametrize("order", [4, 6])
+def test_the_first_step_of_cold_walls(order):
+    odd = {k: 4 / (k * np.pi) for k in range(1, 400, 2)}
+    run = js.evolve(HEAT, js.interval(0.0, 1.0, 41), 1.0, t=(0.0, 0.2), steps=20, order=order, save=20)
+    error = np.abs(run.u[1] - modes(odd)[1](run.cloud.points[:, 0], 0.01)).max()
+    assert 0.5 < run.error_estimate()[1].max() / error < 5 and run.flags
+
+
+@pytest.mark.parametrize("order", [6, 8])
+@pytest.mark.parametrize("steps", [5, 20, 80])
+def test_radau_is_not_doubted_without_need(order, steps):
+    start, exact = modes({1: 1.0})
+    run = js.evolve(HEAT, js.interval(0.0, 1.0, 41), start, t=(0.0, 0.3), steps=steps, order=order)
+    error = np.abs(run.u[-1] - exact(run.cloud.points[:, 0], 0.3)).max()
+    assert 0.5 < run.error_estimate()[-1].max() / error < 50
+
+
+def test_radau_takes_the_steps_that_a_tolerance_needs():
+    start, exact = modes({1: 1.0})
+    run = js.evolve(HEAT, js.interval(0.0, 1.0, 41), start, t=(0.0, 0.3), tol=1e-8, order=8)
+    assert np.abs(run.u[-1] - exact(run.cloud.points[:, 0], 0.3)).max() < 1e-7
+    assert run.stats["steps"] < 40
+
+
+@pytest.mark.parametrize("last", [2.3, 20.3])
+def test_errors_of_steps_in_waves_add_up(last):
+    """They turn with the wave: their sizes are added."""
+    problem = js.Problem(lambda u, x, t: js.dt(u, 2)(x) - js.laplacian(u)(x), ENDS)
+    start = (lambda x: jnp.sin(jnp.pi * x[0]), 0.0)
+    run = js.evolve(problem, js.interval(0.0, 1.0, 21), start, t=(0.0, last), tol=1e-5, order=8)
+    error = np.abs(run.u[-1] - np.sin(np.pi * run.cloud.points[:, 0]) * np.cos(np.pi * last)).max()
+    assert 0.5 < run.stats["error_in_time"] / error < 20
+
+
+def beside(large, **steps):
+    """A field driven by cos 50 t, another of its own beside it: the run, and the first one's error."""
+    shape, a = (lambda x: jnp.sin(jnp.pi * x[0])), 0.1 * np.pi**2
+    driven = lambda x, t: (50 * jnp.cos(50 * t) + a * jnp.sin(50 * t)) * shape(x)
+    pde = lambda w, x, t: jnp.stack([js.dt(w[0])(x) - 0.1 * js.laplacian(w[0])(x) - driven(x, t),
+                                     js.dt(w[1])(x) - 0.1 * js.laplacian(w[1])(x)])  # fmt: skip
+    start = lambda x: jnp.stack([0.0 * x[0], large * shape(x)])
+    run = js.evolve(js.Problem(pde, ENDS, fields=2), js.interval(0.0, 1.0, 21), start, t=(0.0, 1.0), **steps)
+    return run, np.abs(run.u[-1, :, 0] - np.sin(np.pi * run.cloud.points[:, 0]) * np.sin(50.0)).max()
+
+
+@pytest.mark.parametrize("large", [1.0, 1e3, 1e8])
+def test_each_field_by_its_own_size(large):
+    run, error = beside(large, steps=12)
+    assert error > 0.03 and run.stats["error_in_time"] > 0.02
+    assert any("error in time" in flag for flag in run.flags)
+    told = run.error_estimate()[-1].max(axis=0)
+    assert error / 2 < told[0] < 10 * error and told[1] < 1e-3 * large
+
+
+@pytest.mark.parametrize("large", [1.0, 1e5, 1e9])
+def test_tolerances_are_each_fields_own(large):
+    run, error = beside(large, tol=1e-4)
+    assert error < 1e-3 and run.flags == []
+
+
+def test_a_field_that_is_nothing_but_round_off_stops_nothing():
+    """No coupling is left of the second one, but its matrix has the noise of one; from zero it would ask for all."""
+    one = lambda w, x: js.dt(w)(x) - js.laplacian(w)(x)
+    pde = lambda w, x, t: jnp.stack([one(w[0], x), one(w[1], x) + 0.0 * js.grad(w[0])(x)[0]])
+    start = lambda x: jnp.stack([jnp.sin(jnp.pi * x[0]), 0.0 * x[0]])
+    run = js.evolve(js.Problem(pde, ENDS, fields=2), js.interval(0.0, 1.0, 21), start, t=(0.0, 0.1), tol=1e-8)
+    assert run.stats["steps"] < 60 and run.flags == []
+
+
+def test_a_field_from_zero_that_another_makes():
+    """Of the size of 1e-6 of the one that drives it; relative to nothing no first step would do."""
+    a = np.pi**2
+    pde = lambda w, x, t: jnp.stack([js.dt(w[0])(x) - js.laplacian(w[0])(x) - 1e-6 * w[1](x) ** 2,
+                                     js.dt(w[1])(x) - 2 * js.laplacian(w[1])(x)])  # fmt: skip
+    start = lambda x: jnp.stack([0.0 * x[0], jnp.sin(jnp.pi * x[0])])
+    cloud = js.interval(0.0, 1.0, 21)
+    coarse, fine = (js.evolve(js.Problem(pde, ENDS, fields=2), cloud, start, t=(0.0, 1.0 / a), tol=tol)
+                    for tol in (1e-4, 1e-8))  # fmt: skip
+    off = np.abs(coarse.u[-1] - fine.u[-1]).max(axis=0) / np.abs(fine.u[-1]).max(axis=0)
+    assert off.max() < 5e-3 and coarse.stats["steps"] < 200
+
+
+SEAM = {"left": js.periodic("left", "right")}
+
+
+@pytest.mark.parametrize("n", [41, 81])
+@pytest.mark.parametrize("name", ["source", "wave", "reaction", "capacity", "square", "start"])
+def test_what_jumps_across_the_seam_of_a_periodic_pair(name, n):
+    """A saw's teeth, which no order sees: the error falls with the spacing alone. Compared with a finer cloud."""
+    heat = lambda u, x: js.dt(u)(x) - 0.2 * js.laplacian(u)(x)
+    pde, start = {
+        "source": (lambda u, x, t: heat(u, x) - x[0], 0.0),
+        "wave": (lambda u, x, t: js.dt(u, 2)(x) - js.laplacian(u)(x) + 3 * u(x) - x[0], (0.0, 0.0)),
+        "reaction": (lambda u, x, t: heat(u, x) + 5 * x[0] * u(x), 1.0),
+        "capacity": (lambda u, x, t: (1 + 4 * x[0]) * js.dt(u)(x) - js.laplacian(u)(x) - jnp.sin(5 * t), 0.0),
+        "square": (lambda u, x, t: heat(u, x) + 5 * x[0] * u(x) ** 2, 1.0),
+        "start": (lambda u, x, t: heat(u, x), lambda x: x[0]),
+    }[name]
+    run, fine = (js.evolve(js.Problem(pde, SEAM), js.interval(0.0, 1.0, m), start, t=(0.0, 0.5), steps=20)
+                 for m in (n, 16 * (n - 1) + 1))  # fmt: skip
+    error = np.abs(run.u[-1] - fine.u[-1][::16]).max()
+    assert error > 1e-4 and 0.7 * error < run.error_estimate()[-1].max() < 3 * error
+
+
+def test_a_seam_of_much_is_a_flag_and_one_of_nothing_is_none():
+    heat = lambda k: lambda u, x, t: js.dt(u)(x) - 0.1 * js.laplacian(u)(x) + 5 * k(x[0]) * u(x)
+    for k, wrong in ((lambda s: s, True), (lambda s: 1 + jnp.sin(2 * jnp.pi * s), False)):
+        run = js.evolve(js.Problem(heat(k), SEAM), js.interval(0.0, 1.0, 41), 1.0, t=(0.0, 1.0), steps=20)
+        assert any("both sides of a periodic pair" in flag for flag in run.flags) == wrong
+
+
+def test_a_pencil_with_a_growing_mode_tells_nothing(monkeypatch):
+    """Where that of two orders more makes the error grow beyond the solution, another is asked: here it is made to."""
+    from jsmitsm.evolution.run import Run
+
+    made, asked = Run.beside, []
+
+    def beside(self, order, t, u):
+        semi = made(self, order, t, u)
+        asked.append(order)
+        if order == self.order + 2:  # of u_t = u'' the equation that runs backwards
+            values = tuple(np.negative(v) if k == 0 else v for k, v in enumerate(semi.system.values))
+            semi.system = semi.system.with_values(values)
+        return semi
+
+    problem = js.Problem(lambda u, x, t: js.dt(u)(x) - js.laplacian(u)(x), ENDS)
+    start = lambda x: jnp.sin(2 * jnp.pi * x[0])
+    run = js.evolve(problem, js.interval(0.0, 1.0, 21), start, t=(0.0, 0.1), steps=40)
+    monkeypatch.setattr(Run, "beside", beside)
+    error = np.abs(run.u[-1] - np.exp(-0.4 * np.pi**2) * start(run.cloud.points.T)).max()
+    assert error / 3 < run.error_estimate()[-1].max() < 100 * error and asked == [6, 5]

@@ -159,6 +159,24 @@ def test_a_run_has_no_derivative_forward():
         jax.jvp(last, (jnp.asarray(0.3),), (jnp.asarray(1.0),))
 
 
+def cooled(k):
+    """By its operator: what is traced are the matrices."""
+    problem = js.Problem(lambda u, x, t: js.dt(u)(x) - k * js.laplacian(u)(x), everywhere(ROD, js.dirichlet(0.0)))
+    return js.evolve(problem, ROD, 1.0, t=(0.0, 0.1), steps=2, order=2).u[-1, 5]
+
+
+@pytest.mark.parametrize(("derivative", "words"), [
+    (jax.jacfwd, "jax.grad, jax.vjp"),
+    (lambda f: lambda k: jax.jit(lambda k: jax.jvp(f, (k,), (1.0,)))(k), "jax.grad, jax.vjp"),
+    (lambda f: lambda k: jax.linearize(f, k)[1](1.0), "jax.grad, jax.vjp"),
+    (jax.hessian, "first derivatives alone"),
+    (lambda f: jax.grad(jax.grad(f)), "first derivatives alone"),
+])  # fmt: skip
+def test_what_a_run_has_no_derivatives_for_is_said_in_words(derivative, words):
+    with pytest.raises(ValueError, match=words):
+        derivative(cooled)(0.3)
+
+
 @pytest.mark.parametrize("scheme", ["imex", "esdirk"])
 def test_sources_that_vanish_digit_by_digit(scheme):
     """Far from its middle a pulse is hardly a number any more; no residual is small then."""
@@ -510,6 +528,42 @@ def test_gradients_are_those_of_differences(made, scheme):
     assert abs(along - slope(total, p, way)) < 1e-7 * abs(along)
 
 
+@pytest.mark.parametrize("end", [
+    lambda k: js.dirichlet(k),
+    lambda k: js.dirichlet(lambda x, t: 0.2 + k * t),
+    lambda k: js.neumann(lambda x, t: jnp.sin(k * t)),
+    lambda k: js.condition(lambda u, x, n, t: u(x) + n @ js.grad(u)(x) - k * t),
+])  # fmt: skip
+def test_gradients_by_what_conditions_close_over(end):
+    """Not under jit, and with neither times nor parameters traced."""
+
+    def last(k):
+        problem = js.Problem(COOLING.pde, {"left": end(k), "right": js.dirichlet(0.0)})
+        return js.evolve(problem, ROD, 0.2, t=(0.0, 0.2), steps=3, order=2).u[-1, 5]
+
+    k = jnp.asarray(0.7)
+    found = jax.grad(last)(k)
+    assert abs(found - slope(last, k, 1.0)) < 1e-7 * abs(found)
+    assert np.abs(jax.vmap(last)(jnp.array([0.7, 0.9])) - jnp.stack([last(k), last(0.9)])).max() < 1e-12
+
+
+@pytest.mark.parametrize(("rate", "scheme"), [(1, "radau"), (1, "imex"), (1, "esdirk"), (2, "auto")])
+def test_gradients_by_what_a_source_closes_over(rate, scheme):
+    reacts = 1.0 if rate == 1 and scheme != "radau" else 0.0
+
+    def last(k):
+        problem = js.Problem(
+            lambda u, x, t: js.dt(u, rate)(x) - js.laplacian(u)(x) + reacts * u(x) ** 2 - k * jnp.sin(k * t),
+            COOLING.bcs,
+        )
+        start = 0.2 if rate == 1 else (0.0, 0.0)
+        return js.evolve(problem, ROD, start, t=(0.0, 0.2), steps=3, order=2, scheme=scheme).u[-1, 5]
+
+    k = jnp.asarray(0.7)
+    found = jax.grad(last)(k)
+    assert abs(found - slope(last, k, 1.0)) < 1e-7 * abs(found)
+
+
 def test_the_way_back_makes_its_stages_anew_where_they_do_not_fit(monkeypatch):
     def total(k, scheme):
         problem = hot({"k": k, "s": 0.7, "b": 0.5})
@@ -586,6 +640,61 @@ def constrained(u, x, t):
     return jnp.stack([js.dt(u[0])(x) - a, u(x)[0] - x[0]])
 
 
+RADIATING = js.condition(lambda u, x, n: js.dt(u)(x) + n @ js.grad(u)(x))
+
+
+@pytest.mark.parametrize("term", [
+    lambda u, x: js.laplacian(js.dt(u))(x),
+    lambda u, x: js.laplacian(js.dt(u, 2))(x),
+    lambda u, x: js.grad(js.dt(u))(x)[0],
+    lambda u, x: js.partial(js.dt(u), (2,))(x),
+    lambda u, x: js.hessian(js.dt(u))(x)[0, 0],
+    lambda u, x: js.divergence(lambda y: js.grad(u)(y) + 0.1 * js.grad(js.dt(u))(y))(x),
+    lambda u, x: js.divergence(lambda y: y * js.dt(u)(y))(x),
+    lambda u, x: js.laplacian(lambda y: u(y) + 0.1 * js.dt(u)(y))(x),
+    lambda u, x: jax.grad(js.dt(u))(x)[0] * u(x),
+])  # fmt: skip
+def test_a_derivative_of_a_rate_is_refused_in_words(term):
+    words = "derivative of a rate as an unknown of its own"
+    for order in (1, 2):
+        with pytest.raises(ValueError, match=words):
+            stated(lambda u, x, t, order=order: js.dt(u, order)(x) - js.laplacian(u)(x) - 0.1 * term(u, x))
+
+    def coupled(u, x, t):
+        other = js.dt(u[1])(x) - js.laplacian(u[1])(x)
+        return jnp.stack([js.dt(u[0])(x) - js.laplacian(u[0])(x) - 0.1 * term(u[1], x), other])
+
+    with pytest.raises(ValueError, match=f"of field 1.*{words}"):
+        evolved(js.Problem(coupled, COOLING.bcs, fields=2), jnp.zeros(2))
+
+
+def test_a_rate_as_a_field_of_its_own():
+    """The remedies: a pseudo-parabolic equation, and a rate in a condition, u_t + u_x = 0 at the end."""
+    decay = np.pi**2 / (1 + 0.1 * np.pi**2)
+
+    def pseudo(w, x, t):
+        u, v = w
+        return jnp.stack([js.dt(u)(x) - v(x), v(x) - 0.1 * js.laplacian(v)(x) - js.laplacian(u)(x)])
+
+    start = lambda x: jnp.array([1.0, -decay]) * jnp.sin(jnp.pi * x[0])  # noqa: E731
+    run = js.evolve(js.Problem(pseudo, COOLING.bcs, fields=2), ROD, start, t=(0.0, 0.1), steps=10, order=6)
+    truth = np.stack([start(x) for x in np.asarray(ROD.points)]) * np.exp(-0.1 * decay)
+    assert np.abs(run.u[-1] - truth).max() < 1e-4 * decay
+
+    k = 0.8603335890193798  # k tan k = 1
+
+    def heat(w, x, t):
+        u, v = w
+        return jnp.stack([js.dt(u)(x) - v(x), v(x) - js.laplacian(u)(x)])
+
+    end = js.condition(lambda w, x, n: w[1](x) + n @ js.grad(w[0])(x))
+    start = lambda x: jnp.array([1.0, -(k**2)]) * jnp.sin(k * x[0])  # noqa: E731
+    run = js.evolve(js.Problem(heat, {"left": js.dirichlet(0.0), "right": end}, fields=2), ROD, start, t=(0.0, 0.5),
+                    steps=10, order=6)  # fmt: skip
+    truth = np.stack([start(x) for x in np.asarray(ROD.points)]) * np.exp(-0.5 * k**2)
+    assert np.abs(run.u[-1] - truth).max() < 1e-6
+
+
 @pytest.mark.parametrize(("call", "words"), [
     (lambda: js.evolve(js.Problem(constrained, everywhere(SQUARE, js.dirichlet(0.0, field=0)), fields=2), SQUARE, 0.0,
                        (0.0, 1.0), steps=4), "pde: field 1 has no rate"),
@@ -614,6 +723,14 @@ def constrained(u, x, t):
                      scheme="radau"), "radau\" serves linear problems"),
     (lambda: js.solve(js.Problem(lambda u, x: js.dt(u)(x) - js.laplacian(u)(x), COOLING.bcs), ROD), "js.evolve"),
     (lambda: js.dt(lambda x: x[0]), "js.dt takes the unknown u itself"),
+    (lambda: js.solve(js.Problem(lambda u, x: js.laplacian(u)(x) - 1.0, {**COOLING.bcs, "right": RADIATING}), ROD),
+     r"bcs\['right'\]: js.dt\(u\) in a condition"),
+    (lambda: js.eigen(js.Problem(lambda u, x: js.laplacian(u)(x), {**COOLING.bcs, "right": RADIATING}), ROD, 2),
+     r"bcs\['right'\]: js.dt\(u\) in a condition"),
+    (lambda: js.eigen(js.Problem(lambda u, x: js.laplacian(u)(x), COOLING.bcs), ROD, 2,
+                      mass=lambda u, x: js.dt(u)(x)), "mass: js.dt.* has no rates"),
+    (lambda: stated(COOLING.pde, right=RADIATING), r"bcs\['right'\]: js.dt\(u\) in a condition"),
+    (lambda: stated(COOLING.pde, right=js.condition(lambda u, x, n, t: js.dt(u)(x) - 1.0)), "a field v of its own"),
 ])  # fmt: skip
 def test_refused_in_words(call, words):
     with pytest.raises(ValueError, match=words):

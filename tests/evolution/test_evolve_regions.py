@@ -100,3 +100,25 @@ def test_every_region_has_its_condition_on_one_group():
         for bcs, cloud in (({"boundary": {"a": held, "b": loses}}, LAYERS), ({"left": held, "right": loses}, parted))
     ]
     assert np.abs(runs[0].u[-1]).max() > 0.01 and (runs[0].u == runs[1].u).all()
+
+
+def test_gradients_by_what_functions_close_over():
+    def last(k):
+        pde = {n: lambda u, x, t, n=n: heat(n)(u, x, t) - (k * t if n == "a" else 0.0) for n in K}
+        sides = js.interface(FLUX, jump=lambda x, t: k * t, source=lambda x, t: k)
+        problem = js.Problem(pde, {"boundary": js.dirichlet(lambda x, t: k * t), "a|b": sides})
+        return js.evolve(problem, LAYERS, 1.0, t=(0.0, 0.1), steps=3, order=2, progress=False).u[-1, 3]
+
+    found = jax.grad(last)(0.7)
+    assert abs(found - (last(0.8) - last(0.6)) / 0.2) < 1e-8 * abs(found)  # linear in k
+
+
+def test_rates_in_conditions_and_their_derivatives_are_refused():
+    slope = {n: lambda u, x, t, n=n: heat(n)(u, x, t) - js.laplacian(js.dt(u))(x) for n in K}
+    rated = js.interface({**FLUX, "b": lambda u, x, n: n @ js.grad(u)(x) + js.dt(u)(x)})
+    for pde, sides, words in (
+        (slope, js.interface(FLUX), "derivative of a rate as an unknown of its own.*region 'a'"),
+        ({n: heat(n) for n in K}, rated, r"js.dt\(u\) in a condition"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            js.evolve(js.Problem(pde, {"boundary": js.dirichlet(0.0), "a|b": sides}), LAYERS, 1.0, (0.0, 0.1), steps=2)

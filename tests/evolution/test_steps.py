@@ -11,7 +11,7 @@ from jsmitsm.evolution.steps.control import controlled
 from jsmitsm.evolution.steps.stepping import RadauStepper, Stepper, Stopped
 from jsmitsm.evolution.steps.tableaux import EULER, KENCARP4, RADAU
 
-EPS = 1e-14
+EPS, LARGEST = 1e-14, lambda x: float(np.abs(x).max())
 
 
 def test_kencarp4_meets_its_order_conditions():
@@ -70,14 +70,17 @@ class Rod:
         ends = self.exact(t, self.x[[0, -1]])
         return (*self.force(t, ends), ends)
 
-    def stages(self, sampling):
-        def step(t, h):
-            times = t + h * sampling.nodes
-            ends = sampling.blend @ np.array([self.exact(v, self.x[[0, -1]]) for v in times])
-            made = [self.force(v, e) for v, e in zip(times[sampling.stages], ends)]
-            return (*(np.array(v) for v in zip(*made)), ends)
+    def made(self, t, h, sampling):
+        times = t + h * sampling.nodes
+        ends = sampling.blend @ np.array([self.exact(v, self.x[[0, -1]]) for v in times])
+        found = [self.force(v, e) for v, e in zip(times[sampling.stages], ends)]
+        return (*(np.array(v) for v in zip(*found)), ends)
 
-        self.step = step
+    def between(self, t, h, sampling):
+        return self.made(t, h, sampling)[0]
+
+    def stages(self, sampling):
+        self.step = lambda t, h: self.made(t, h, sampling)
         return self
 
 
@@ -116,6 +119,65 @@ def test_controlled_steps_keep_the_tolerance_with_few_sizes(kind):
     assert seen[-1][0] == 1.0 and counts["steps"] == len(seen) - 1
     assert max(np.abs(y - rod.exact(t)).max() for t, y in seen) < 2e-5  # of a few steps together
     assert rod.system.factorisations <= 6
+
+
+class Modes:
+    """y' = z y + f(t), each component by itself, from what its answer, e^(z t) unless told, is at the start."""
+
+    def __init__(self, z, answer=None):
+        every = np.arange(len(z))
+        self.z, self.answer = z, answer or (lambda t: np.exp(z * t))
+        a, b = (Sparse(v, every, every, (len(z), len(z))) for v in (-z, np.ones(len(z))))
+        self.system = System(a, (b,), every[:, None].astype(float))
+
+    def force(self, t):
+        if self.answer(0.0)[0] == 1.0:
+            return np.zeros(len(self.z))
+        return (self.answer(t + 1e-4) - self.answer(t - 1e-4)) / 2e-4 - self.z * self.answer(t)
+
+    def start(self, t):
+        return self.force(t), np.zeros(len(self.z)), np.zeros(0)
+
+    def between(self, t, h, sampling):
+        return np.array([self.force(t + h * c) for c in sampling.nodes[sampling.stages]])
+
+    def step(self, t, h):
+        made = self.between(t, h, self.sampling)
+        return made, np.zeros_like(made), np.zeros((len(made), 0))
+
+    def estimate(self, kind, h=1.0):
+        """What a step says of its error, over its error."""
+        self.sampling = (RADAU if kind == "radau" else KENCARP4).sampling(True)
+        stepper = RadauStepper(self.system, self) if kind == "radau" else Stepper(self.system, self, KENCARP4)
+        step = stepper.advance(stepper.first(self.answer(0.0), 0.0), 0.0, h, True)
+        return np.abs(step.error / (step.y - self.answer(h)))
+
+
+@pytest.mark.parametrize(("kind", "most"), [("esdirk", 8.0), ("radau", 2.5)])
+def test_what_a_step_says_of_its_error_is_of_its_size(kind, most):
+    """Of all that dies out, from what is resolved to what is over at once."""
+    found = Modes(-np.geomspace(0.05, 1e5, 60)).estimate(kind)
+    assert (found > 0.4).all() and (found < most).all()
+
+
+@pytest.mark.parametrize("w", [0.5, 1.0, 2.0])
+def test_radau_sees_what_forces_make_of_its_error(w):
+    """y = 2 + sin(w t), from what hardly moves by itself to what is stiff."""
+    z = -np.geomspace(1e-2, 1e3, 30)
+    found = Modes(z, lambda t: 2.0 + np.sin(w * t) * np.ones(len(z))).estimate("radau")
+    assert (found > 0.4).all() and (found < 8.0).all()
+
+
+@pytest.mark.parametrize("w", [0.3, 1.0, 2.0, 4.0, 10.0, 30.0, 100.0])
+def test_radau_sees_its_error_in_waves(w):
+    """u'' = -w^2 u, resolved and not."""
+    one, w2 = (Sparse(np.array([v]), np.zeros(1, int), np.zeros(1, int), (1, 1)) for v in (1.0, w**2))
+    drive = Modes(np.zeros(2), lambda t: np.array([np.cos(w * t), -w * np.sin(w * t)]))
+    drive.force, drive.sampling = lambda t: np.zeros(2), RADAU.sampling(False)
+    stepper = RadauStepper(System(w2, (one.with_values(np.zeros(1)), one)), drive)
+    step = stepper.advance(stepper.first(drive.answer(0.0), 0.0), 0.0, 1.0, True)
+    ratio = np.linalg.norm(step.error / [1, w]) / np.linalg.norm((step.y - drive.answer(1.0)) / [1, w])
+    assert 0.5 < ratio < 4.0
 
 
 def test_a_step_that_never_does_is_named():
@@ -159,3 +221,21 @@ def test_interpolation_is_exact_for_polynomials_of_degree_five():
         assert np.allclose((weights * nodes[index] ** k).sum(axis=1), times**k, atol=1e-12)
     assert np.allclose(dense_output.derivative(nodes, nodes[:, None] ** 4, 0.45, 2), 12 * 0.45**2)
     assert jnp.shape(weights) == (6, 6)
+
+
+@pytest.mark.parametrize("place", [0, 3, 6])
+@pytest.mark.parametrize("rate", [-0.1, -0.5, -2.0, -10.0, -1e3, 0.3j, 1.0j])
+def test_how_far_off_interpolation_is(place, rate):
+    """Of modes that are over within a step too, from the start or from a later jump on, alone and beside a slow one."""
+    nodes = np.arange(11.0)
+    answer = lambda t: np.exp(rate * np.maximum(t - place, 0.0) - 0.02 * t).real
+    for beside in (0.0, 1.0):
+        made = lambda t: answer(t) + beside * np.exp(-0.02 * t)  # noqa: B023
+        for part in (0.02, 0.2, 0.5, 0.8, 0.98):
+            t = place + part
+            index, weights = dense_output.weights(nodes, np.array([t]))
+            error = abs((weights * made(nodes)[index]).sum() - made(np.array([t]))[0])
+            (told,) = dense_output.doubts(nodes, list(made(nodes)[:, None, None]), np.array([t]), LARGEST)
+            assert told[0] > error / 5 - 1e-12
+            assert told[0] < 50 * error + 1e-6 or part == 0.02
+    assert not dense_output.doubts(nodes, list(made(nodes)[:, None, None]), nodes, LARGEST).any()

@@ -62,6 +62,38 @@ def test_the_corner_of_an_ell():
     assert (0.2 < ratio).all() and (ratio < 15).all()
 
 
+@pytest.mark.parametrize("tol", [1e-9, -1e-9])
+def test_a_condition_that_changes_within_a_free_boundary(tol):
+    """Half of the bottom of a square is held, and all the rest is free; on graded finite elements."""
+    groups = {"held": lambda x: (x[:, 1] < 1e-9) & (x[:, 0] < 0.5 + tol), "free": lambda x: x[:, 0] > -9}
+    cloud = js.from_sdf(js.sdf.rectangle((0, 0), (1, 1)), ((0, 0), (1, 1)), 0.1, groups=groups)
+    bcs = {"held": js.dirichlet(0.0), "free": js.neumann(0.0)}
+    ratio = told(js.eigen(js.Problem(lambda u, x: -js.laplacian(u)(x), bcs), cloud, 3), [1.6303, 10.4251, 15.2419])
+    assert (0.2 < ratio).all() and (ratio < 5).all()
+
+
+def test_the_ends_of_a_clamped_side():
+    """The lowest mode of an elastic square, both Lame constants 1: it is singular where the clamped side ends."""
+    elastic = lambda u, x: jnp.stack([-js.laplacian(u[k])(x) - 2 * js.grad(js.divergence(u))(x)[k] for k in range(2)])
+
+    def traction(u, x, n):
+        g = jnp.stack([js.grad(u[0])(x), js.grad(u[1])(x)])
+        return jnp.trace(g) * n + (g + g.T) @ n
+
+    bcs = {side: js.condition(traction) for side in ("right", "bottom", "top")} | {"left": js.dirichlet(0.0)}
+    modes = js.eigen(js.Problem(elastic, bcs, fields=2), js.rectangle((0, 0), (1, 1), (13, 13)), 1)
+    assert 0.3 < told(modes, [1.14421])[0] < 5
+
+
+def test_waves_of_equations_that_have_them_only_together():
+    """A damped string, u_t = v and v_t = u_xx - 4 v: a wave of number k has a value of about the size k."""
+    damped = lambda u, x: jnp.stack([u(x)[1], js.laplacian(u[0])(x) - 4 * u(x)[1]])
+    string = js.Problem(damped, {side: js.dirichlet(0.0, field=0) for side in ENDS}, fields=2)
+    modes = js.eigen(string, js.interval(0.0, 1.0, 41), 2, mass=(1.0, 1.0))
+    assert modes.flags == []
+    assert 0.9 < modes._question.highest() / (20 * np.pi) < 1.1
+
+
 def test_smooth_modes_are_judged_by_two_orders_alone():
     """Where nothing is missed the other order decides, coefficients that vary or not."""
     for problem, exact in (

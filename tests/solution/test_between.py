@@ -100,6 +100,18 @@ def test_an_equation_that_a_periodic_pair_does_not_repeat(pde, off):
     assert any("periodic pair" in flag for flag in sol.flags) and not fine.flags
 
 
+@pytest.mark.parametrize("n", [41, 81, 161])
+@pytest.mark.parametrize("order", [4, 6])
+@pytest.mark.parametrize("pde", [lambda u, x: u(x) - js.laplacian(u)(x) - x[0],
+                                 lambda u, x: u(x) + u(x) ** 2 - js.laplacian(u)(x) - x[0]])  # fmt: skip
+def test_the_estimate_knows_what_a_periodic_pair_does_not_repeat(pde, order, n):
+    """The error falls with the spacing alone, of any order, and is told where it is too small for a flag."""
+    pair = {"left": js.periodic("left", "right")}
+    fine, sol = (js.solve(js.Problem(pde, pair), js.interval(0.0, 1.0, m), order=order) for m in (16 * (n - 1) + 1, n))
+    error = abs(sol.u - fine.u[::16]).max()
+    assert 1e-4 < error < 1.2 * sol.error_estimate().max() < 3 * error
+
+
 def test_a_periodic_equation_is_no_flag():
     pde = lambda u, x: js.laplacian(u)(x) - (2 + jnp.sin(2 * jnp.pi * x[0])) * u(x) + jnp.cos(2 * jnp.pi * x[0])
     sol = js.solve(js.Problem(pde, {"left": js.periodic("left", "right")}), js.interval(0.0, 1.0, 33), order=6)

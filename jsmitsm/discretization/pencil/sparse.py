@@ -98,7 +98,7 @@ def _product(form: _Form, values: Any, x: Any) -> Any:
 
 
 def _product_forward(form: _Form, values: Any, x: Any) -> tuple[Any, Any]:
-    return _product(form, values, x), (values, x)
+    return _product.fun(form, values, x), (values, x)  # itself, for second derivatives
 
 
 def _product_backward(form: _Form, kept: Any, bar: Any) -> tuple[Any, Any]:

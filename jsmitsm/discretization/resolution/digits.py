@@ -15,10 +15,11 @@ from jsmitsm.equation.traced import Traced
 from jsmitsm.particle.recursion import Recursion
 from jsmitsm.runtime.tracers import concrete, is_traced
 
-# The highest degree of local polynomials where information travels, and where convection outweighs diffusion between
-# neighbours by the third number: measured, degree 12 leaves errors of 1e-5 there, and 1e-6 in their estimates. Beyond
-# the fourth two degrees have all of the gain.
-TRAVELLING, CARRIED, PECLET, STRONG = 10, 8, 5.0, 50.0
+# The highest degree of local polynomials where information travels: measured, degree 12 leaves errors of 1e-5 there,
+# and 1e-6 in their estimates. Elsewhere there is no bound that is ever met.
+TRAVELLING, FREE = 10, 18
+# Convection over diffusion between neighbours from which on a basis of local solutions is made orthonormal.
+CARRIED = 1.0
 # Particles whose coefficients are looked at.
 LOOKED_AT = 64
 # Data that turn within a support by less than the first angle are mild (half of it where lower terms make waves), by
@@ -66,24 +67,19 @@ def suited_depth(
     dear = not traced.constant or (flat and not few(traced, cloud, part))
     if dear and max(found.source, found.coefficients, 2.0 * found.reaction, 2.0 * found.carried) < MILD:
         return 2
-    waves = max(found.source, found.reaction) if traced.constant and not found.carried else 0.0
+    waves = max(found.source, found.reaction, found.carried) if traced.constant else 0.0
     return 6 if rec.dim == 2 and rec.order <= HIGH and waves > OSCILLATING else USUAL
 
 
-def room(rec: Recursion, order: int, traced: Traced, cloud: Cloud, params: Any, part: Part | None = None) -> int:
+def room(rec: Recursion, order: int) -> int:
     """By how many degrees the recursion of a fit of this order may go deeper, at the most.
 
-    An equation whose leading terms say little of an axis, or little at all within a support, bounds the deep
-    coefficients weakly: what it says of the others is multiplied degree by degree.
+    An equation whose leading terms say little of an axis bounds the deep coefficients weakly: what it says of the
+    others is multiplied degree by degree.
     """
     if rec.fields > 1 or len(set(rec.orders)) > 1:
-        return CARRIED + TRAVELLING
-    if rec.orders[0] == 1 or lags(rec):
-        return max(TRAVELLING - order, 0)
-    peclet = _peclet(rec, traced, cloud, params, part)
-    if peclet <= PECLET:
-        return CARRIED + TRAVELLING
-    return min(max(CARRIED - order, 0), 2 if peclet > STRONG else CARRIED)
+        return FREE
+    return max(TRAVELLING - order, 0) if rec.orders[0] == 1 or lags(rec) else FREE
 
 
 def lags(rec: Recursion) -> bool:
@@ -98,23 +94,37 @@ def _mixed(rec: Recursion, along: np.ndarray) -> np.ndarray:
     return (along[along.sum(axis=1) == rec.orders[0]] > 0).any(axis=0)
 
 
-def _peclet(rec: Recursion, traced: Traced, cloud: Cloud, params: Any, part: Part | None) -> float:
-    """Convection over diffusion between neighbours, the median over some particles; 0 where nothing is known of it."""
-    drift = [s for s, (_, b) in enumerate(rec.slots) if sum(b) == 1]
-    second = [s for s, (_, b) in enumerate(rec.slots) if sum(b) == 2]
+def carries(rec: Recursion, traced: Traced, cloud: Cloud, params: Any, part: Part | None = None) -> bool:
+    """Whether convection may outweigh diffusion between neighbours, in some equation for some field.
+
+    So where nothing can be known of it beforehand: where the coefficients hang on the solution, or are traced.
+    """
+    pairs = [
+        (e, drift, second)
+        for e in np.flatnonzero(np.array(rec.orders) == 2)
+        for k in range(rec.fields)
+        if (drift := _slots(rec, traced, int(e), k, 1)) and (second := _slots(rec, traced, int(e), k, 2))
+    ]
     points = concrete(cloud.points)
-    if rec.orders[0] != 2 or not (drift and second) or points is None or not traced.linear or is_traced(params):
-        return 0.0
+    if not pairs or points is None or not traced.linear or is_traced(params):
+        return bool(pairs)
     points = np.asarray(points)
     n, spacing = len(points), float((np.prod(np.ptp(points, axis=0)) / len(points)) ** (1.0 / rec.dim))
     if part is not None:
         n, spacing = part.count, part.spacing
-    sample = Whole(part).every(points, max(1, n // LOOKED_AT))
-    jac = traced.leading(sample, params)
+    jac = traced.leading(Whole(part).every(points, max(1, n // LOOKED_AT)), params)
     if is_traced(jac):
-        return 0.0
-    jac = np.asarray(jac)[0]
-    if not np.isfinite(jac).all():  # refused where the coefficients are used
-        return 0.0
-    speed, diffusion = np.linalg.norm(jac[drift], axis=0), np.abs(jac[second]).max(axis=0)
-    return float(np.median(speed * spacing / np.where(diffusion > 0, diffusion, np.inf)))
+        return True
+    jac = np.nan_to_num(np.asarray(jac))  # what is not finite is refused where it is used
+    for e, drift, second in pairs:
+        speed, diffusion = np.linalg.norm(jac[e, drift], axis=0), np.abs(jac[e, second]).max(axis=0)
+        if np.median(speed * spacing - CARRIED * diffusion) > 0.0:
+            return True
+    return False
+
+
+def _slots(rec: Recursion, traced: Traced, equation: int, field: int, degree: int) -> list[int]:
+    """The derivatives of a degree of a field that an equation holds."""
+    return [
+        s for s, (k, b) in enumerate(rec.slots) if k == field and sum(b) == degree and traced.pattern[equation, s]
+    ]

@@ -15,6 +15,7 @@ import jax
 import numpy as np
 
 from jsmitsm.evolution.gradient import additive, radau
+from jsmitsm.evolution.gradient.backward import once
 from jsmitsm.evolution.gradient.bars import Bars
 from jsmitsm.evolution.gradient.inputs import Given, Inputs
 from jsmitsm.evolution.space.semidiscrete import Semidiscrete
@@ -93,7 +94,8 @@ def _recorded(plan: Plan, given: Inputs) -> Any:
     if plan.newton:
         raise ValueError(
             "scheme: Newton's method for the stages of a run is done by the host, which neither jax.jit nor jax.vmap "
-            'can wait for; call jax.grad without them, or use scheme="imex" where only lower derivatives are nonlinear'
+            "nor a derivative of a gradient can wait for; call jax.grad without them, or use "
+            'scheme="imex" where only lower derivatives are nonlinear'
         )
     if given.push is not None and isinstance(plan.scheme, Additive):
         return additive.scanned(plan.scheme, plan.semi, plan.steps, given)
@@ -106,7 +108,7 @@ def _called(function: Any, shape: Any, *given: Any) -> Any:
     def on_host(*given: Any) -> Any:
         return function(*jax.tree.map(np.asarray, given))
 
-    return jax.pure_callback(on_host, shape, *given, vmap_method="sequential")
+    return jax.pure_callback(on_host, shape, *once(given), vmap_method="sequential")
 
 
 def _forward_rule(plan: Plan, given: Inputs) -> tuple[Any, Any]:

@@ -10,6 +10,7 @@ import numpy as np
 
 from jsmitsm.evolution.evolution import Evolution
 from jsmitsm.evolution.gradient.adjoint import Plan, states
+from jsmitsm.evolution.gradient.backward import backward
 from jsmitsm.evolution.gradient.inputs import Inputs, Push
 from jsmitsm.evolution.run import Run, drifted
 from jsmitsm.evolution.space.semidiscrete import Semidiscrete, centred
@@ -39,7 +40,7 @@ def differentiable(run: Run, steps: int, parts: np.ndarray) -> Evolution:
         renewed = drifted if semi.reference is not None else None
         newton = not semi.linear and run.name != "imex"
         plan = Plan(semi, scheme, newton, steps - done, is_traced(run.t), run.throw, renewed, fresh)
-        out = _stepped(plan, given)
+        out = states(plan, backward(given))
         made = len(out) - 1
         found.append(out if not found else out[1:])
         known.append([v if done + made == steps else v[:, : made * m] for v in (samples[0], *samples[3:4])])
@@ -55,16 +56,16 @@ def differentiable(run: Run, steps: int, parts: np.ndarray) -> Evolution:
     return Evolution(t0 + (t1 - t0) * parts, u, rates, run.cloud, recipe, good, stats)
 
 
-def _stepped(plan: Plan, given: Inputs) -> Any:
-    try:
-        return states(plan, given)
-    except TypeError as error:
-        if "forward-mode" not in str(error):
-            raise
-        raise ValueError(
-            "js.evolve: a run has derivatives backward alone, and jax.jvp, jax.jacfwd and jax.hessian ask for those "
-            "forward; use jax.grad, jax.vjp or jax.jacrev"
-        ) from None
+def _entered(semi: Semidiscrete, *others: Any) -> tuple[Any, ...]:
+    """The equations and what else enters the run, refused in words where derivatives are asked for forward."""
+    parts = [semi.source, semi.given, semi.stiff_held, *semi.masses_held]
+    own = semi.system.values, [m.values for m in parts]
+    (values, of_parts), others = backward((own, others))
+    if is_traced(own):
+        semi = semi.stated(values, None)
+        made = [m.with_values(v) for m, v in zip(parts, of_parts)]
+        semi.source, semi.given, semi.stiff_held, semi.masses_held = *made[:3], made[3:]
+    return semi, *others
 
 
 def _inputs(
@@ -75,7 +76,7 @@ def _inputs(
     m, s = len(sampling.nodes) - 1, len(sampling.stages)
     places = np.append((np.arange(steps)[:, None] + sampling.nodes[:-1]).reshape(-1), steps) + done
     times = t0 + h * places
-    samples = semi.samples(times)
+    semi, samples, start, h = _entered(semi, semi.samples(times), run.start, h)
     windows = np.arange(steps)[:, None] * m + np.arange(m + 1)
     numbers = np.append(0, windows[:, sampling.stages].reshape(-1))
     of_stages = [v if m == s else v[:, numbers] for v in samples]  # as large as the forces: no copy where all are asked
@@ -83,7 +84,7 @@ def _inputs(
     force, jump = semi.forces(*mixed, *of_stages[2:])
     push = None if semi.linear else Push(semi.source.values, semi.rest, semi.params, semi.reference)
     if y is None:
-        y = _started(run, samples, force[0], jump[0], h, semi.system.undriven())
+        y = _started(run, semi, start, samples, force[0], jump[0], h, semi.system.undriven())
     values = tuple(jnp.asarray(v) for v in semi.system.values)
     return samples, Inputs(values, push, y, h, force, jump, of_stages[0].T, times if m == s else times[numbers])
 
@@ -117,10 +118,12 @@ def _interpolated(found: Any, held_values: Any, weights: Any, index: Any, at: An
     return centred(flat.reshape(len(index), -1, fields)[:, partner], floating)
 
 
-def _started(run: Run, samples: list[Any], force: Any, jump: Any, h: Any, still: np.ndarray) -> Any:
+def _started(
+    run: Run, semi: Semidiscrete, start: tuple[Any, ...], samples: list[Any], force: Any, jump: Any, h: Any,
+    still: np.ndarray,
+) -> Any:  # fmt: skip
     """The state at the start with its impulse, see march.started."""
-    semi = run.semi
-    flat = [jnp.asarray(v).reshape(-1) for v in run.start]
+    flat = [jnp.asarray(v).reshape(-1) for v in start]
     y = jnp.concatenate([v[semi.free] for v in flat])
     if semi.second or not len(semi.held):
         return y

@@ -38,8 +38,8 @@ class RegionsRun(Run):
         self.counts["seconds in pencils"] = self.counts.get("seconds in pencils", 0.0) + time.perf_counter() - began
         return semi
 
-    def finer(self, t: float, u: Any) -> RegionsSemidiscrete:
-        return self._parts(np.asarray(t), self.order + 2, None, None)
+    def beside(self, order: int, t: float, u: Any) -> RegionsSemidiscrete:
+        return self._parts(np.asarray(t), order, None, None)
 
     def _parts(self, t: Any, order: int, massed: Any, stencils: Any) -> RegionsSemidiscrete:
         problem = self.timed.at(t, self.params)

@@ -53,6 +53,11 @@ class RegionsTimed:
         """Whether there are values of u apart from the operator in any region."""
         return any(part.values for part in self.parts.values())
 
+    @property
+    def order(self) -> int:
+        """That of the highest derivatives in space."""
+        return max(part.order for part in self.parts.values())
+
     def at(self, t: Any, params: Any = None) -> Problem:
         """The closed problem at a moment; params: others than its own."""
         return at_moment(self.problem, t, params)

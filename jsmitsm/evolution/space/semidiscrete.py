@@ -99,6 +99,11 @@ class Semidiscrete:
             return None
         return np.asarray(self.points)[self.free // self.fields]
 
+    @property
+    def free_fields(self) -> np.ndarray:
+        """The field of each free value of a state."""
+        return self.free % self.fields
+
     def _damping(self, mass: Sparse, amount: float) -> Sparse:
         """amount M (1 - P), P the leave-one-out prediction of each value: it damps what only the cloud sees."""
         fits = local_fits(self.disc, max(self.disc.rec.order - 2, 1), alone=True)
@@ -167,7 +172,8 @@ class Semidiscrete:
 
     def samples(self, times: Any) -> list[Any]:
         """The same at several moments (m,), moments last."""
-        if is_traced(times, self.params, self.points):
+        # Functions of the problem may close over what is traced, where neither times nor parameters are.
+        if is_traced(times, self.params, self.points, self.timed.problem, self.timed.rest):
             return [jnp.moveaxis(v, 0, -1) for v in jax.vmap(self.sample)(jnp.asarray(times))]
         if self.timed.steady:
             if self._still is None:
@@ -339,6 +345,10 @@ class Driver:
         self._last = t + h, [v[:, -1:] for v in samples]
         force, held = self.semi.forces(*self.semi.blended(self.sampling, samples))
         return force, held, samples[0][:, self.sampling.stages].T
+
+    def between(self, t: float, h: float, sampling: Sampling) -> Any:
+        """F elsewhere in a step."""
+        return self.semi.forces(*self.semi.blended(sampling, self.semi.samples(t + h * sampling.nodes)))[0]
 
     def _samples(self, t: float, h: float) -> list[Any]:
         semi, nodes = self.semi, self.sampling.nodes

@@ -64,6 +64,11 @@ class Timed:
         return self.problem.pde
 
     @property
+    def order(self) -> int:
+        """That of the highest derivatives in space."""
+        return max(self.space.order)
+
+    @property
     def linear(self) -> bool:
         return not self.rest.slots
 
@@ -169,6 +174,13 @@ def _recorded(stated: Problem, dim: int) -> Traced:
     if whole.n_equations != stated.fields:
         raise ValueError(
             f"pde: returns {whole.n_equations} residual(s) for fields={stated.fields}; a system of F fields needs F"
+        )
+    slope = next((k for k, b in whole.slots if k >= RATE and any(b)), None)
+    if slope is not None:
+        of = f" of field {slope % RATE}" if stated.fields > 1 else ""
+        raise ValueError(
+            f"pde: it holds a derivative in space of a rate{of}; write a derivative of a rate as an unknown of its "
+            "own: a second field v, js.dt(u)(x) - v(x) = 0 its equation, and v in the place of js.dt(u) (docs: time)"
         )
     return whole
 

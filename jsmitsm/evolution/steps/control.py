@@ -21,15 +21,15 @@ def controlled(
 ) -> dict[str, int]:  # fmt: skip
     """Steps of (t1 - t0) / 2^k, k changing where the estimate asks for it; a step begins at a multiple of its size.
 
-    size: the norm of an error relative to the solution. coarsest: the least k. Raises Stopped where the smallest step
-    does not do.
+    size: the norm of an error relative to the solution, that of the worst field. coarsest: the least k. Raises Stopped
+    where the smallest step does not do.
     """
     whole = t1 - t0
     step = stepper.first(y, t0)
     keep(t0, step)
     level, place = FIRST, 0  # the time is t0 + place whole / 2^level
     counts = {"steps": 0, "rejected": 0}
-    power = 1.0 / min(stepper.order, 4)
+    power = 1.0 / (4 if stepper.order < 5 else 6)  # of KenCarp4 and of Radau
     while place < 2**level:
         t, h = t0 + whole * place / 2**level, whole / 2**level
         try:

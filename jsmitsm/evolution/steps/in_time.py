@@ -1,7 +1,8 @@
-"""The error in time of a run: what the embedded scheme says of some of its steps, carried along by the equations."""
+"""The error in time of a run: what the scheme says of some of its steps, carried along by the equations."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -26,12 +27,14 @@ class InTime:
     """Adds up errors of steps; what damps the solution damps them, by one step of backward Euler for each look.
 
     parts: those of each of PARTS parts of a run by themselves, when they were last added to and their sum, for those
-    who know what makes them grow.
+    who know what makes them grow. sizes: of the fields (F,) of what is free. lasting: whether nothing is damped, as in
+    waves; then errors add up by their sizes, for they turn with the solution.
     """
 
-    def __init__(self, t0: float, t1: float) -> None:
+    def __init__(self, t0: float, t1: float, sizes: Callable[[np.ndarray], np.ndarray], lasting: bool) -> None:
         self.times: list[float] = []
-        self.sizes: list[float] = []
+        self.sizes: list[np.ndarray] = []
+        self._sizes, self._lasting = sizes, lasting
         self.parts: dict[int, tuple[float, np.ndarray]] = {}
         self._whole = t0, t1
         self._sum: Any = None
@@ -44,15 +47,17 @@ class InTime:
         t0, t1 = self._whole
         part = int(PARTS * (t - t0) / (t1 - t0) - 1e-9)
         self.parts[part] = t, self.parts.get(part, (t, 0.0))[1] + weight * step.error
-        before = self._sum
-        if before is not None and not system.second and getattr(stepper, "newton", None) is None:
+        before, error = self._sum, np.abs(step.error) if self._lasting else step.error
+        if before is not None and not self._lasting and getattr(stepper, "newton", None) is None:
             before = system.resolvent(stepper.smallest(h)).solve(system.mass(before))
-        self._sum = weight * step.error + (0.0 if before is None else before)
+        self._sum = weight * error + (0.0 if before is None else before)
         self.times.append(t)
-        self.sizes.append(system.largest(self._sum[: system.n]))
+        self.sizes.append(self._sizes(self._sum[: system.n]))
 
     def at(self, times: np.ndarray) -> np.ndarray:
-        """The size of the error at some times."""
+        """The sizes of the errors of fields (S, F) at times (S,), within the first step already those of its end."""
         if not self.times:
-            return np.zeros(len(times))
-        return np.interp(times, [min(self.times[0], float(times[0])), *self.times], [0.0, *self.sizes])
+            return np.zeros((len(times), 1))
+        times = np.where(times > self._whole[0], np.maximum(times, self.times[0]), times)
+        known = [min(self.times[0], self._whole[0]), *self.times]
+        return np.stack([np.interp(times, known, [0.0, *one]) for one in zip(*self.sizes)], axis=-1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
@@ -104,8 +105,9 @@ EULER = Additive(
 class Radau:
     """Radau IIA of three stages and order 5, decoupled by the eigenvectors of the inverse of its matrix.
 
-    inverse = vectors diag(values) vectors^-1, the first eigenvalue real, the others conjugate. error (3,): the
-    coefficients of the embedded estimate (Hairer and Wanner II, IV.8).
+    inverse = vectors diag(values) vectors^-1, the first eigenvalue real, the others conjugate. lagrange, slopes (3, 3):
+    values and rates, at ``places`` of a step, of the polynomial through its start (zero) and its stages; left (3, 3):
+    from what that leaves over there the coefficients of 1, t, t^2 of q in (t - c_1)(t - c_2)(t - c_3) q.
     """
 
     matrix: np.ndarray
@@ -113,14 +115,27 @@ class Radau:
     values: np.ndarray
     vectors: np.ndarray
     back: np.ndarray
-    error: np.ndarray
+    places: np.ndarray
+    lagrange: np.ndarray
+    slopes: np.ndarray
+    left: np.ndarray
 
     def sampling(self, consistent: bool) -> Sampling:
-        a, b, c = self.nodes
-        nodes = np.array([0.0, a, (a + b) / 2, b, (b + c) / 2, c])
         if consistent:
-            return _sampling(self.matrix, self.nodes, nodes)
+            return _sampling(self.matrix, self.nodes, self._denser)
         return _sampling(self.matrix, self.nodes, np.concatenate([[0.0], self.nodes]), False)
+
+    @cache  # noqa: B019 (there is one Radau)
+    def between(self, consistent: bool) -> Sampling:
+        """At the last two places, with the boundary data of the polynomial through those of the stages."""
+        s = _sampling(self.matrix, self.nodes, self._denser, consistent)
+        start = np.multiply.outer(1.0 - self.lagrange[1:].sum(axis=1), np.eye(len(s.nodes))[0])
+        return Sampling(s.nodes, np.array([2, 4]), self.lagrange[1:] @ s.blend + start)
+
+    @property
+    def _denser(self) -> np.ndarray:
+        a, b, c = self.nodes
+        return np.array([0.0, a, (a + b) / 2, b, (b + c) / 2, c])
 
 
 def _radau() -> Radau:
@@ -133,8 +148,12 @@ def _radau() -> Radau:
     values, vectors = np.linalg.eig(np.linalg.inv(a))
     order = np.argsort(np.abs(values.imag) + (values.imag < 0))  # real, then the one above the axis, then below
     values, vectors = values[order], vectors[:, order]
-    error = np.array([-(13 + 7 * r) / 3, (-13 + 7 * r) / 3, -1 / 3])
-    return Radau(a, np.array([(4 - r) / 10, (4 + r) / 10, 1.0]), values, vectors, np.linalg.inv(vectors), error)
+    nodes = np.array([(4 - r) / 10, (4 + r) / 10, 1.0])
+    places, k = np.array([0.0, nodes[:2].mean(), nodes[1:].mean()]), np.arange(1, 4)
+    back = np.linalg.inv(nodes[:, None] ** k)
+    lagrange, slopes = places[:, None] ** k @ back, (k * places[:, None] ** (k - 1)) @ back
+    left = np.linalg.inv(places[:, None] ** (k - 1)) / np.prod(places[:, None] - nodes, axis=1)
+    return Radau(a, nodes, values, vectors, np.linalg.inv(vectors), places, lagrange, slopes, left)
 
 
 RADAU = _radau()

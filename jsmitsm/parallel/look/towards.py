@@ -25,7 +25,7 @@ def corrected(low: Local, values: np.ndarray, taylor: Any) -> tuple[np.ndarray, 
     with us.phase():
         if order + 2 > HIGHEST:  # the highest that may be asked for
             raise ValueError(f"error_estimate: needs expansions of order {order + 2}, and {HIGHEST} is the highest")
-        other = compared(rec.order, rec.depth, _room(low, order + 2), max(rec.orders), lags(rec))
+        other = compared(rec.order, rec.depth, room(rec, order + 2), max(rec.orders), lags(rec))
     error, trust, units = _towards(low, values, taylor, other)
     below = lower(order, max(rec.orders))
     if not (other > order >= HIGH and trust < TRUSTED and below < order):
@@ -40,17 +40,12 @@ def corrected(low: Local, values: np.ndarray, taylor: Any) -> tuple[np.ndarray, 
     return (beside * (far / near) ** DOUBT if 0.0 < near < far else error), units
 
 
-def _room(low: Local, order: int) -> int:
-    disc = low.disc
-    return room(disc.rec, order, disc.traced, low.cloud, disc.problem.params, low.part)
-
-
 def _towards(low: Local, values: np.ndarray, taylor: Any, order: int) -> tuple[np.ndarray, float, Any]:
     """What leads from the own values to the solution by method S of another order, how far its rows are trusted, and
     the units of the fields."""
     us = low.team
     with us.phase():
-        depth = min(low.disc.rec.depth, _room(low, order))
+        depth = min(low.disc.rec.depth, room(low.disc.rec, order))
     high = Local(us, low.problem, low.mine, Settings("S", order, depth, None, True, "loo"))
 
     def start() -> np.ndarray:

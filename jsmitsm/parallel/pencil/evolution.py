@@ -126,7 +126,7 @@ def evolve(
     times = np.where(parts >= 1.0, t1, t0 + parts * (t1 - t0))
     states = history.at(times, history.states)
     rates = history.at(times, history.rates) if run.second else None
-    later = float(history.in_time.at(times).max()) / (history.scale or 1.0) if history.in_time.times else None
+    later = history.part_in_time(history.in_time_at(times))
     if later is not None and later > LARGE:
         run.flags.append(f"The estimated error in time is {later:.0%} of the solution: take more steps, or a tol.")
     end, system = time.perf_counter(), run.semi.system

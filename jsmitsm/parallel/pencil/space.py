@@ -74,6 +74,10 @@ class OwnSemidiscrete(Semidiscrete):
         self.apart = all(local.team.gather(self.apart))
         self.system: Any = OwnSystem(local, self.system, solver)
 
+    @property
+    def free_fields(self) -> np.ndarray:
+        return self.own % self.fields
+
     def forces(self, held: Any, conditions: Any, source: Any, *rates: Any) -> tuple[Any, Any]:
         force, moved = super().forces(held, conditions, source, *rates)
         return force[:, self.rows], moved[:, self.rows]

@@ -15,8 +15,10 @@ from jsmitsm.discretization.layout import Class, Discretization
 from jsmitsm.discretization.parts.whole import whole
 from jsmitsm.particle.moments import Row
 from jsmitsm.particle.polynomials import monomials_on_host
-from jsmitsm.solution.look.between import beyond_kinks, solved_alone
+from jsmitsm.solution.look.between import beyond_kinks, seam, solved_alone
+from jsmitsm.solution.look.edges import singular
 from jsmitsm.solution.look.halfway import nearest_of, pairs
+from jsmitsm.solution.look.sizes import predicted, scales
 
 # A polynomial does not reach its nearest neighbours where it misses one by this part of the largest change to any of
 # them: 0.1 to 0.5 beside square roots and jumps of data. By order: up to 3, and above.
@@ -29,17 +31,26 @@ FAR = 0.2
 # The error is so many times what misses, drawn at random, make of the solution. Measured on singular points and jumps
 # wherever they lie in the spacing, orders 2 to 6, lines and squares: by 1.0 it would be 0.2 to 5 times the error.
 TIMES = 1.4
+# Beside a singular end of a boundary that is not all held less counts too, and the error, which reaches all of the
+# domain, is so many times as large. Measured on changes of conditions within a side and on corners of elastic bodies:
+# by 1.0 it would be 0.1 to 1.0 times the error, beside r^(3/2) 2 times.
+ENDED, OPEN = 0.003, 3.0
+# Values that differ there by this part of the range from the linear function through their neighbours are looked at.
+ROUGH_END = 0.01
 # Those who miss by this part of the largest miss are named.
 NAMED = 0.2
 
 
 def beyond_orders(run: Any, values: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """What no order sees makes of the solution of a run, (N, F): beyond kinks and jumps, and out of reach.
+    """What no order sees makes of the solution of a run, (N, F): beyond kinks, jumps and seams, and out of reach.
 
     known: the error that two orders tell of the own particles.
     """
     kinks = beyond_kinks(run, values)
     found = np.maximum(unmet(run, values)[0], _faint(run, values, known))
+    found = np.maximum(found, _at_ends(run, values))
+    if run.nums is not None and run.factor is not None:
+        found = np.maximum(found, seam(run, values))
     return found if kinks is None else np.maximum(found, kinks)
 
 
@@ -50,6 +61,28 @@ def _faint(run: Any, values: np.ndarray, known: np.ndarray) -> np.ndarray:
     made, told = _unmet(run, values, FAINT)[0], whole(run.disc)
     size = told.norm(told.own(made))
     return made if size == 0 else made * min(1.0, TRUSTED * told.norm(known) / size)
+
+
+def _at_ends(run: Any, values: np.ndarray) -> np.ndarray:
+    """What is made of values out of reach beside singular corners and changes of conditions, where orders are blind.
+
+    A process that has but a part of the cloud does not see all of a boundary's ends.
+    """
+    alone = run.formulation != "lsq" and run.rows is not None and run.factor is not None and run.disc.part is None
+    if not alone or run.disc.scheme.method not in ("S", "III"):
+        return np.zeros(run.disc.held.shape)
+    misses = _misses(run, values)
+    beside = singular(run.disc, misses.most)
+    return made_of(run, OPEN * TIMES * misses.of(ENDED) * beside)[0] if beside.any() else np.zeros(beside.shape)
+
+
+def rough_ends(run: Any, values: np.ndarray) -> bool:
+    """Whether the boundary may have a singular end: a look at the values alone, without polynomials."""
+    if run.disc.part is not None:
+        return False
+    points = np.asarray(run.disc.cloud.points, float)
+    away = np.stack([np.abs(v - predicted(points, v)) for v in values.T], axis=1) / scales(values)
+    return bool((away * singular(run.disc, away) > ROUGH_END).any())
 
 
 def unmet(run: Any, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -108,6 +141,14 @@ class Misses:
         self.disc, self.values, self.fitted = disc, values, fitted
         self.points = np.asarray(disc.points, float)
         self.parts = [_OfClass(self, cls, row) for cls, row in zip(*rows)]
+
+    @property
+    def most(self) -> np.ndarray:
+        """The largest of what is left of the nearest neighbours (N, F)."""
+        out = np.zeros(self.disc.held.shape)
+        for part in self.parts:
+            out[part.ids] = part.most
+        return out
 
     def at(self, other: np.ndarray) -> np.ndarray:
         """The values (n, F) of particles, images among them."""

@@ -33,7 +33,6 @@ def unseen(
     disc, every = run.disc, whole(run.disc)
     part = lambda missed: share(every.own(missed), every.own(values), told=every)
     found["missed"] = missed = 0.0 if cleared and even(run) else part(between(run, values))
-    found["seam"] = beyond = part(seam(run, values))
     told = list[str]()
     # Constant coefficients degenerate nowhere, and layers that fall to nothing within the spacing may be right.
     if not (disc.linear and disc.traced.constant):
@@ -43,16 +42,27 @@ def unseen(
             f"Between the particles the equation is missed by as much as makes {missed:.0%} of the solution: the "
             "source or a coefficient changes within the spacing, unseen by the particles; refine there, or smooth it."
         )
-    told += data(run, values, found)
-    if beyond > CLEARED:
-        told.append(
-            f"The equation is not the same on both sides of a periodic pair, which makes {beyond:.0%} of the solution: "
-            "let the source and the coefficients repeat themselves, or refine there."
-        )
-    return told
+    return told + data(run, values, found)
 
 
 def data(run: Any, values: np.ndarray, found: dict[str, float]) -> list[str]:
+    """Of boundary data between the particles, and of the equation beyond a seam."""
+    return _between(run, values, found) + _across(run, values, found)
+
+
+def _across(run: Any, values: np.ndarray, found: dict[str, float]) -> list[str]:
+    """Of an equation that a periodic pair does not repeat, which an estimate knows, but not by name."""
+    every = whole(run.disc)
+    found["seam"] = beyond = share(every.own(seam(run, values)), every.own(values), told=every)
+    if beyond <= CLEARED:
+        return []
+    return [
+        f"The equation is not the same on both sides of a periodic pair, which makes {beyond:.0%} of the solution: "
+        "let the source and the coefficients repeat themselves, or refine there."
+    ]
+
+
+def _between(run: Any, values: np.ndarray, found: dict[str, float]) -> list[str]:
     """Of boundary data between the particles; where these seem not to see them, the polynomials are asked."""
     every = whole(run.disc)
     made = share(every.own(unseen_data(run)), every.own(values), told=every)
