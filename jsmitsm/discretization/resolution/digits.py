@@ -106,15 +106,16 @@ def carries(rec: Recursion, traced: Traced, cloud: Cloud, params: Any, part: Par
         if (drift := _slots(rec, traced, int(e), k, 1)) and (second := _slots(rec, traced, int(e), k, 2))
     ]
     points = concrete(cloud.points)
-    if not pairs or points is None or not traced.linear or is_traced(params):
+    unknown = points is None or any(concrete(x) is None for x in jax.tree.leaves((traced, params)))
+    if not pairs or unknown or not traced.linear:
         return bool(pairs)
+    if is_traced(traced, params):  # what only carries derivatives changes nothing
+        traced, params = jax.tree.map(concrete, (traced, params))
     points = np.asarray(points)
     n, spacing = len(points), float((np.prod(np.ptp(points, axis=0)) / len(points)) ** (1.0 / rec.dim))
     if part is not None:
         n, spacing = part.count, part.spacing
     jac = traced.leading(Whole(part).every(points, max(1, n // LOOKED_AT)), params)
-    if is_traced(jac):
-        return True
     jac = np.nan_to_num(np.asarray(jac))  # what is not finite is refused where it is used
     for e, drift, second in pairs:
         speed, diffusion = np.linalg.norm(jac[e, drift], axis=0), np.abs(jac[e, second]).max(axis=0)
