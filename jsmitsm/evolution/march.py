@@ -106,6 +106,8 @@ def marched(run: Run, steps: int | None, tol: float | None, parts: np.ndarray, s
             _equal(run, y, np.linspace(t0, t1, steps + 1), history, shown)
     except Stopped as stopped:
         fault = str(stopped)
+        if run.name == "imex" and not run.semi.linear and not run.second:
+            fault += '; scheme="esdirk" solves for what is nonlinear, as stiff reactions need it'
     return history, fault
 
 

@@ -750,3 +750,14 @@ def test_a_run_that_blows_up_keeps_its_last_good_state():
 def test_too_few_steps_are_flagged():
     problem = js.Problem(lambda u, x, t: js.dt(u)(x) - js.laplacian(u)(x) - 100 * jnp.sin(40 * t), COOLING.bcs)
     assert any("error in time" in flag for flag in js.evolve(problem, ROD, 0.0, t=(0.0, 3.0), steps=8).flags)
+
+
+def test_stiff_reactions_are_told_the_scheme_that_solves_for_them():
+    """u' = -1e6 (u^3 - cos t), explicitly: no step is small enough, or what there is blows up."""
+    rate = lambda u, x, t: js.dt(u)(x) - 0.01 * js.laplacian(u)(x) + 1e6 * (u(x) ** 3 - jnp.cos(t))
+    problem = js.Problem(rate, {"left": js.neumann(0.0), "right": js.neumann(0.0)})
+    cloud = js.interval(0.0, 1.0, 9)
+    with pytest.raises(js.SolveError, match='scheme="esdirk" solves for what is nonlinear'):
+        js.evolve(problem, cloud, 1.0, t=(0.0, 1.0), steps=20, scheme="imex")
+    run = js.evolve(problem, cloud, 1.0, t=(0.0, 1.0), steps=40, scheme="esdirk")
+    assert np.abs(run.u[-1] - np.cos(1.0) ** (1 / 3)).max() < 1e-4
