@@ -761,3 +761,17 @@ def test_stiff_reactions_are_told_the_scheme_that_solves_for_them():
         js.evolve(problem, cloud, 1.0, t=(0.0, 1.0), steps=20, scheme="imex")
     run = js.evolve(problem, cloud, 1.0, t=(0.0, 1.0), steps=40, scheme="esdirk")
     assert np.abs(run.u[-1] - np.cos(1.0) ** (1 / 3)).max() < 1e-4
+
+
+def test_gradients_of_a_quasilinear_start_against_its_conditions():
+    """Coefficients are others once the conditions are met, and the pencil is made anew before the first step."""
+
+    def last(k):
+        pde = lambda u, x, t: js.dt(u)(x) - js.divergence(lambda y: (1 + u(y) ** 2) * js.grad(u)(y))(x)
+        problem = js.Problem(pde, {"left": js.dirichlet(k), "right": js.dirichlet(k)})
+        start = lambda x: 1.0 + jnp.sin(jnp.pi * x[0])
+        return js.evolve(problem, js.interval(0.0, 1.0, 15), start, t=(0.0, 0.05), steps=4).u[-1].sum()
+
+    value, slope = jax.value_and_grad(last)(0.7)
+    assert float(value) == pytest.approx(float(last(0.7)), rel=1e-12)
+    assert float(slope) == pytest.approx(float(last(0.7 + 1e-5) - last(0.7 - 1e-5)) / 2e-5, rel=1e-6)

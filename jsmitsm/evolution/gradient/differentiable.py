@@ -17,7 +17,7 @@ from jsmitsm.evolution.space.semidiscrete import Semidiscrete, centred
 from jsmitsm.evolution.space.system import VANISHING
 from jsmitsm.evolution.steps import dense_output
 from jsmitsm.evolution.steps.tableaux import Additive, Radau
-from jsmitsm.runtime.tracers import is_traced
+from jsmitsm.runtime.tracers import concrete, is_traced
 from jsmitsm.runtime.whole_program import in_one_program
 from jsmitsm.solution.fit import Recipe
 from jsmitsm.taylor.multi_indices import HIGHEST
@@ -38,6 +38,10 @@ def differentiable(run: Run, steps: int, parts: np.ndarray) -> Evolution:
         semi = run.semi
         samples, given = _inputs(run, semi, scheme, t0, h, done, steps - done, y)
         renewed = drifted if semi.reference is not None else None
+        if y is None and renewed and _leaves(semi, given, t0):  # a start that contradicts the conditions
+            y = given.y
+            run.renew(y, t0)
+            continue
         newton = not semi.linear and run.name != "imex"
         plan = Plan(semi, scheme, newton, steps - done, is_traced(run.t), run.throw, renewed, fresh)
         out = states(plan, backward(given))
@@ -54,6 +58,14 @@ def differentiable(run: Run, steps: int, parts: np.ndarray) -> Evolution:
     good = finite if is_traced(finite) else bool(finite)
     stats = {"scheme": "Radau IIA 5" if isinstance(scheme, Radau) else scheme.name, "steps": steps}
     return Evolution(t0 + (t1 - t0) * parts, u, rates, run.cloud, recipe, good, stats)
+
+
+def _leaves(semi: Semidiscrete, given: Inputs, t0: Any) -> bool:
+    """Whether the coefficients are others once the conditions are met."""
+    y, known, t = (concrete(v) for v in (given.y, given.known[0], t0))
+    if y is None or known is None or t is None:
+        return False
+    return drifted(semi, semi.placed(np.asarray(y)[: semi.system.n], np.asarray(known)), float(t))
 
 
 def _entered(semi: Semidiscrete, *others: Any) -> tuple[Any, ...]:
