@@ -5,6 +5,7 @@ from __future__ import annotations
 from functools import partial
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -62,10 +63,11 @@ def differentiable(run: Run, steps: int, parts: np.ndarray) -> Evolution:
 
 def _leaves(semi: Semidiscrete, given: Inputs, t0: Any) -> bool:
     """Whether the coefficients are others once the conditions are met."""
-    y, known, t = (concrete(v) for v in (given.y, given.known[0], t0))
-    if y is None or known is None or t is None:
+    if any(concrete(v) is None for v in jax.tree.leaves((given, t0))):
         return False
-    return drifted(semi, semi.placed(np.asarray(y)[: semi.system.n], np.asarray(known)), float(t))
+    host, t = jax.tree.map(concrete, (given, t0))
+    semi = semi.stated(host.values, host.push)
+    return drifted(semi, semi.placed(np.asarray(host.y)[: semi.system.n], np.asarray(host.known[0])), float(t))
 
 
 def _entered(semi: Semidiscrete, *others: Any) -> tuple[Any, ...]:
