@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from copy import copy
+from dataclasses import replace
 from typing import Any
 
 import jax.numpy as jnp
@@ -94,7 +95,8 @@ class Factorization(KeptMatrix):
             problem, old.cloud, method, order, kernel, Stencils(table(old), None), old.basis_terms,
             depth=old.rec.depth,
         )
-        if disc.scheme != old.scheme or not np.array_equal(disc.held, old.held):
+        alike = replace(disc.scheme, carried=old.scheme.carried)  # convection may be stronger now
+        if alike != old.scheme or not np.array_equal(disc.held, old.held):
             refuse_other()
         problem = disc.problem
         nums = numbers(disc, problem)

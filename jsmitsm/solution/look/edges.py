@@ -43,14 +43,16 @@ def singular(disc: Discretization, missed: np.ndarray) -> np.ndarray:
     """Which values (N, F) are beside corners and changes of conditions where the solution is singular.
 
     missed (N, F): what the polynomials leave of their neighbours. Where all of the boundary around is held the error
-    stays where it is made, and is not meant here.
+    stays where it is made, and is not meant here; of one field neither are corners between open sides, r^2 at the
+    right angle.
     """
     cloud, found = disc.cloud, np.zeros(missed.shape, bool)
     points, rim = np.asarray(cloud.points, float), np.asarray(cloud.boundary)
     if cloud.dim == 1 or len(points) <= 2 * cloud.dim:
         return found
-    ends, free = np.flatnonzero(edges(cloud)), np.zeros(len(points), bool)
+    ends, free, held = np.flatnonzero(edges(cloud)), np.zeros(len(points), bool), np.zeros(len(points), bool)
     free[rim] = ~disc.held[rim].all(axis=1)
+    held[rim] = ~free[rim] | (disc.rec.fields > 1)
     if not len(ends):
         return found
     tree = cKDTree(points)
@@ -59,7 +61,7 @@ def singular(disc: Discretization, missed: np.ndarray) -> np.ndarray:
     beside, around = (tree.query_ball_point(points[ends], part * spacing[ends]) for part in _RING)
     for some, more in zip(beside, around):
         ring = np.array(more, int)[away[more]]
-        if free[some].any() and len(ring):
+        if free[some].any() and held[some].any() and len(ring):
             alone = missed[some].max(axis=0) > _ALONE * missed[ring].max(axis=0)
             found[np.array(some, int)[:, None], np.flatnonzero(alone)] = True
     return found

@@ -34,7 +34,7 @@ TIMES = 1.4
 # Beside a singular end of a boundary that is not all held less counts too, and the error, which reaches all of the
 # domain, is so many times as large. Measured on changes of conditions within a side and on corners of elastic bodies:
 # by 1.0 it would be 0.1 to 1.0 times the error, beside r^(3/2) 2 times.
-ENDED, OPEN = 0.003, 3.0
+ENDED, OPEN = 0.003, 2.0
 # Values that differ there by this part of the range from the linear function through their neighbours are looked at.
 ROUGH_END = 0.01
 # Those who miss by this part of the largest miss are named.
