@@ -284,7 +284,7 @@ def test_what_is_told_is_of_the_kernel_that_is_returned(result):
     """Not of another with a smaller objective that was not taken."""
     history = {"objective": np.array([4.0, 0.25, 2.0])}
     told = js.TuneResult(result.kernel, result.solution, history, step=2)
-    assert "objective 4 -> 2," in repr(told) and "4 to 2" in told._repr_html_() and "0.25" not in told._repr_html_()
+    assert "objective 4 -> 2," in repr(told) and "4 to 2" in told._repr_html_() and "to 0.25" not in told._repr_html_()
     gauge = Objective(problem, cloud, result.kernel, "estimate", {"method": "SSPH", "order": 2})
     at = result.history["objective"][result.step]
     assert float(gauge.measured(result.solution)) == pytest.approx(at, rel=1e-6)
