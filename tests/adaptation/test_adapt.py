@@ -104,10 +104,10 @@ def test_layers_at_both_ends_are_told_by_the_coefficients():
 def test_a_nonlinear_problem_and_its_quantity():
     """u'' = 6 u^2 has the solution (1 + x)^-2; its slope at the right end is -2 / 8."""
     problem = js.Problem(lambda u, x: js.laplacian(u)(x) - 6.0 * u(x) ** 2, ends(1.0, 0.25))
-    found = js.adapt(problem, line, 1e-6, order=4, quantity=lambda sol: sol.flux("right"))
+    found = js.adapt(problem, line, 1e-5, order=4, quantity=lambda sol: sol.flux("right"))
     assert found.reached
-    assert abs(found.quantity + 0.25) <= 3e-6 * 0.25
-    assert found.error <= 1e-6
+    assert abs(found.quantity + 0.25) <= 3e-5 * 0.25
+    assert found.error <= 1e-5
 
 
 def test_the_tolerance_is_on_the_number():
