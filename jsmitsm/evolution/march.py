@@ -193,10 +193,10 @@ def _adaptive(run: Run, y: np.ndarray, t0: float, t1: float, tol: float, history
             history.in_time.add(stepper.inner, step, t, stepper.h)
         history.add(t, step)
 
-    foreseen = _foreseen(run, stepper.inner, y, t0, t1)
-    known, n = sizes(run.semi, y[: run.semi.system.n]), run.semi.system.n
-    driven, coupled = foreseen
-    least = np.where(known < _REST * np.maximum(driven, coupled), np.maximum(driven, coupled), 0.0)
+    driven, coupled = _foreseen(run, stepper.inner, y, t0, t1)
+    n, made = run.semi.system.n, np.maximum(driven, coupled)
+    known = sizes(run.semi, y[:n])
+    least = np.where(known < _REST * made, made, 0.0)
 
     def size(error: np.ndarray) -> float:
         """That of the worst field. What others make of one may be all of it, so that the step itself counts."""
@@ -204,9 +204,10 @@ def _adaptive(run: Run, y: np.ndarray, t0: float, t1: float, tol: float, history
         more = least if run.fields == 1 else np.maximum(least, sizes(run.semi, stepper.y[:n]))
         return float((sizes(run.semi, error[:n]) / history.sizes.scales(more, tol)).max())
 
-    resting = known < _REST * driven  # data that do not change are not passed over
-    rests = bool(resting.any() and (resting | (known == 0)).all() if run.semi.timed.steady else resting.any())
-    counts = controlled(stepper, y, t0, t1, tol, added, tell, size, FIRST if rests else 0)
+    resting = known < _REST * driven
+    # Data that do not change may be passed over once a field moves.
+    rests = (resting | (known == 0)).all() if run.semi.timed.steady else True
+    counts = controlled(stepper, y, t0, t1, tol, added, tell, size, FIRST if resting.any() and rests else 0)
     run.counts.update(counts)
 
 
