@@ -29,10 +29,16 @@ _FAR, _STEEP = 0.5, 0.1
 _ASTRAY = 10.0
 # A way that meets the boundary at a smaller angle (its cosine) would count for too much.
 _GRAZING = 0.02
+# Gauss points more along a facet, of the rule that tells the error of the first.
+_MORE = 2
 
 
-def domain_rule(cloud: Cloud, degree: int) -> tuple[np.ndarray, np.ndarray]:
-    """Points (Q, D) and weights (Q,) for integrals over the domain of functions that polynomials of a degree follow."""
+def domain_rule(cloud: Cloud, degree: int, otherwise: bool = False) -> tuple[np.ndarray, np.ndarray]:
+    """Points (Q, D) and weights (Q,) for integrals over the domain of functions that polynomials of a degree follow.
+
+    otherwise: by a rule that follows the boundary in another way, whose difference tells the error of the first; so
+    too in ``surface_rule``.
+    """
     points = np.asarray(cloud.points, float)
     at, weights = simplex_rule(cloud.dim, degree // 2 + 1)
     corners = points[simplices(cloud)]
@@ -40,21 +46,24 @@ def domain_rule(cloud: Cloud, degree: int) -> tuple[np.ndarray, np.ndarray]:
     volume = np.abs(np.linalg.det(sides))
     inner = np.einsum("qk,mkd->mqd", at, corners), volume[:, None] * weights
     inner = inner[0].reshape(-1, cloud.dim), inner[1].ravel()
-    return inner if cloud.dim == 1 else tuple(map(np.concatenate, zip(inner, _layers(cloud, degree))))  # type: ignore
+    return inner if cloud.dim == 1 else tuple(map(np.concatenate, zip(inner, _layers(cloud, degree, otherwise))))  # type: ignore
 
 
 def surface_rule(
-    cloud: Cloud, named: np.ndarray, members: Members, degree: int
+    cloud: Cloud, named: np.ndarray, members: Members, degree: int, otherwise: bool = False
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Points (Q, D), weights (Q,) and unit normals (Q, D) on the part of the boundary with the particles named (N,)."""
     facets, normal = boundary_facets(cloud)
     ways, near = _ways(cloud, facets, normal)
     most = named[facets].sum(axis=1) * 2 > facets.shape[1]
     own = members(np.asarray(cloud.points, float)[facets].mean(axis=1), normal, most)
+    found = []
+    if otherwise and (cut := _cutting(cloud, facets, normal)).any():
+        own, cut = own & ~cut, cut & named[facets].any(axis=1)
+        found.append(list(_shadows(cloud, named, facets[cut], normal[cut], degree)))
     # Facets of another part may reach across an edge to this one.
     some = np.flatnonzero(own | near)
-    found = []
-    for swept, which in _swept(cloud, facets[some], normal[some], ways[some], degree):
+    for swept, which in _swept(cloud, facets[some], normal[some], ways[some], degree, otherwise):
         at, volume = swept.at(1.0)
         # A layer that ends at the surface is as thick as the way's part along the normal.
         steep = np.einsum("mqd,mqd->mq", swept.way, swept.outward)
@@ -65,14 +74,39 @@ def surface_rule(
     return tuple(np.concatenate(part) for part in zip(*found))  # type: ignore
 
 
-def _layers(cloud: Cloud, degree: int) -> tuple[np.ndarray, np.ndarray]:
+def _cutting(cloud: Cloud, facets: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """Which facets (M, D) cut off an edge of a solid whose shape is not known: they look elsewhere than a corner."""
+    if cloud._shape is not None or cloud.dim < 3:
+        return np.zeros(len(facets), bool)
+    return (np.einsum("mkd,md->mk", normals_of(cloud)[facets], normal) < SMOOTH).any(axis=1)
+
+
+def _shadows(
+    cloud: Cloud, named: np.ndarray, facets: np.ndarray, normal: np.ndarray, degree: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points, weights and normals of facets (M, 3) that cut edges off, by their shadows on the side of their corners
+    named: what a flat side lacks up to its edge."""
+    corners = np.asarray(cloud.points, float)[facets]
+    at, weights = simplex_rule(2, degree // 2 + 1)
+    side = np.einsum("mkd,mk->md", np.nan_to_num(normals_of(cloud)[facets]), named[facets].astype(float))
+    side = side / np.maximum(np.linalg.norm(side, axis=1, keepdims=True), 1e-300)
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    shadow = area * np.maximum(np.einsum("md,md->m", side, normal), 0.0)
+    spots = np.einsum("qk,mkd->mqd", at, corners).reshape(-1, 3)
+    return spots, (shadow[:, None] * weights).ravel(), np.repeat(side, len(at), axis=0)
+
+
+def _layers(cloud: Cloud, degree: int, otherwise: bool) -> tuple[np.ndarray, np.ndarray]:
     """Points (Q, D) and signed weights (Q,) between the facets and the boundary."""
     facets, normal = boundary_facets(cloud)
     ways, near = _ways(cloud, facets, normal)
-    some = np.flatnonzero(near | ~lying_on(cloud, facets))
+    layered = near | ~lying_on(cloud, facets)
+    if otherwise:
+        layered &= ~_cutting(cloud, facets, normal)
+    some = np.flatnonzero(layered)
     found, measure = [np.zeros((0, cloud.dim))], [np.zeros(0)]
     x, w = np.polynomial.legendre.leggauss(degree // 2 + 1)
-    for swept, _ in _swept(cloud, facets[some], normal[some], ways[some], degree):
+    for swept, _ in _swept(cloud, facets[some], normal[some], ways[some], degree, otherwise):
         for share, part in zip((x + 1.0) / 2.0, w / 2.0):
             here, volume = swept.at(share)
             found.append(here.reshape(-1, cloud.dim))
@@ -91,32 +125,32 @@ def _ways(cloud: Cloud, facets: np.ndarray, normal: np.ndarray) -> tuple[np.ndar
 
 
 def _swept(
-    cloud: Cloud, facets: np.ndarray, normal: np.ndarray, ways: np.ndarray, degree: int
+    cloud: Cloud, facets: np.ndarray, normal: np.ndarray, ways: np.ndarray, degree: int, otherwise: bool
 ) -> list[tuple[Swept, np.ndarray]]:
     """The ways from facets (M, D) with outward normals (M, D) to the boundary, and which facets they are from.
 
     Where it is not smooth over facets of a solid whose shape is known, they come last, a point a row.
     """
     if cloud._shape is None or cloud.dim < 3:
-        return [(_over_sides(cloud, facets, normal, ways, degree)[0], np.arange(len(facets)))]
+        return [(_over_sides(cloud, facets, normal, ways, degree, otherwise)[0], np.arange(len(facets)))]
     own = (np.einsum("mkd,md->mk", normals_of(cloud)[facets], normal) >= SMOOTH).all(axis=1)
     some = np.flatnonzero(own)
-    swept, good = _over_sides(cloud, facets[some], normal[some], ways[some], degree)
+    swept, good = _over_sides(cloud, facets[some], normal[some], ways[some], degree, otherwise)
     good &= (np.einsum("mqd,mrd->mqr", swept.outward, swept.outward) >= SMOOTH).all(axis=(1, 2))
     kept = Swept(*(x if x is swept.weights else x[good] for x in swept))
     rest = np.concatenate([np.flatnonzero(~own), some[~good]])
     corners = np.asarray(cloud.points, float)[facets[rest]]
-    parted, of = over_edges(cloud._shape, corners, ways[rest], normal[rest], degree)
+    parted, of = over_edges(cloud._shape, corners, ways[rest], normal[rest], degree, otherwise)
     return [(kept, some[good]), (parted, rest[of])]
 
 
 def _over_sides(
-    cloud: Cloud, facets: np.ndarray, normal: np.ndarray, ways: np.ndarray, degree: int
+    cloud: Cloud, facets: np.ndarray, normal: np.ndarray, ways: np.ndarray, degree: int, otherwise: bool
 ) -> tuple[Swept, np.ndarray]:
     """The ways to a boundary that is smooth over each facet, and over which facets (M,) it was found so."""
     corners = np.asarray(cloud.points, float)[facets]
     # An even number: the middle of a side is as near to one particle as to the other, whose polynomials differ there.
-    at, weights = simplex_rule(cloud.dim - 1, 2 * (degree // 4 + 1))
+    at, weights = simplex_rule(cloud.dim - 1, 2 * (degree // 4 + 1) + _MORE * otherwise)
     base, way = (np.einsum("qk,mkd->mqd", at, x) for x in (corners, ways))
     # Where the shape is known the graph is the start of the way there only.
     graph = _graphs(cloud, corners, facets, normal, degree if cloud._shape is None else min(degree, 4))

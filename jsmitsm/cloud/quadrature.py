@@ -80,6 +80,11 @@ def quadrature(cloud: Cloud, group: str | None = None, degree: int = 8) -> Quadr
     >>> round(float(js.quadrature(cloud).weights.sum()), 12)
     2.0
     """
+    return rule(cloud, group, degree)
+
+
+def rule(cloud: Cloud, group: str | None, degree: int, otherwise: bool = False) -> Quadrature:
+    """The points and weights of ``quadrature``; otherwise: those of another rule, whose difference tells its error."""
     if not is_whole(degree, 1):
         raise ValueError(f"degree: expected a whole number from 1, got {degree!r}")
     if not isinstance(cloud, Cloud):
@@ -87,9 +92,9 @@ def quadrature(cloud: Cloud, group: str | None = None, degree: int = 8) -> Quadr
     if group is not None and not isinstance(group, str):
         raise ValueError(f"group: expected the name of a boundary group, got {group!r}")
     if isinstance(cloud, RegionCloud):
-        return _of_regions(cloud, group, degree)
+        return _of_regions(cloud, group, degree, otherwise)
     if group is None:
-        at, weights = domain_rule(cloud, int(degree))
+        at, weights = domain_rule(cloud, int(degree), otherwise)
         return Quadrature(at, weights, np.full(at.shape, np.nan))
     if group not in cloud.groups or group == "interior":
         known = ", ".join(repr(name) for name in cloud.groups if name != "interior")
@@ -100,17 +105,17 @@ def quadrature(cloud: Cloud, group: str | None = None, degree: int = 8) -> Quadr
         ends, normal = boundary_facets(cloud)
         here = ends[named[ends[:, 0]], 0]
         return Quadrature(np.asarray(cloud.points, float)[here], np.ones(len(here)), normal[named[ends[:, 0]]])
-    return Quadrature(*surface_rule(cloud, named, _members(cloud, named), int(degree)))
+    return Quadrature(*surface_rule(cloud, named, _members(cloud, named), int(degree), otherwise))
 
 
-def _of_regions(cloud: RegionCloud, group: str | None, degree: int) -> Quadrature:
+def _of_regions(cloud: RegionCloud, group: str | None, degree: int, otherwise: bool) -> Quadrature:
     """That of all regions together; of an interface once, with its normals from the first region to the second."""
     parts = [cloud.region(name) for name in cloud.regions]
     if group in cloud.interfaces:
         parts = [cloud.region(sides(str(group))[0])]
     elif group is not None:
         parts = [part for part in parts if group in part.groups] or parts[:1]
-    made = [quadrature(part, group, degree) for part in parts]
+    made = [rule(part, group, degree, otherwise) for part in parts]
     return Quadrature(*(np.concatenate(arrays) for arrays in zip(*made)))
 
 

@@ -16,10 +16,11 @@ from jsmitsm.cloud.sight.walls import Walls, seen
 from jsmitsm.discretization.parts.whole import Part
 from jsmitsm.discretization.periodic import Images, periodic_images, with_corners
 from jsmitsm.discretization.resolution.digits import carries, room, suited_depth, warn_of_float32
+from jsmitsm.discretization.resolution.field_sizes import field_sizes
 from jsmitsm.discretization.supports import check_supports, cut_off, default_kernel, find_stencils, walls_of
 from jsmitsm.equation.branches import FIELD
 from jsmitsm.equation.closing import closed
-from jsmitsm.equation.conditions import Group, group_conditions
+from jsmitsm.equation.conditions import Group, check_collocated, group_conditions
 from jsmitsm.equation.field import RATE
 from jsmitsm.equation.problem import Problem
 from jsmitsm.equation.regions.per_region import PerRegion
@@ -134,6 +135,8 @@ def discretize(
         depth = suited_depth(method, rec, flat, sourced, traced, cloud, problem.params, held, part)
         depth = depth and min(depth, room(rec, order))
     rec = recursion(cloud.dim, order, problem.fields, traced.slots, traced.pattern, traced.order, int(depth))
+    if method == "S":
+        rec = replace(rec, sizes=field_sizes(rec, traced, cloud, problem.params, groups, part))
     scheme = _scheme(method, rec, traced, problem, cloud, basis_terms)
     carried = method == "S" and bool(depth) and carries(rec, traced, cloud, problem.params, part)
     scheme = replace(scheme, **_conditions_layout(groups, rec), sourced=sourced, flat=flat, carried=carried)
@@ -143,7 +146,7 @@ def discretize(
             'plate has); use "S" or "SSPH"'
         )
     if method == "SSPH":
-        _check_collocated(groups, problem.fields)
+        check_collocated(groups, problem.fields)
     if kernel is not None and not is_traced(kernel) and np.shape(kernel.h) not in ((), (len(cloud),)):
         raise ValueError(f"kernel: h has shape {np.shape(kernel.h)}, expected a number or ({len(cloud)},), one each")
     if isinstance(kernel, Constant) and method in ("II", "III"):
@@ -229,17 +232,6 @@ def refuse_jumps(disc: Discretization, problem: Problem, slots: Any = None) -> N
         found = disc.traced.jumps(disc.cloud.points, disc.images.owners(near), params=problem.params, slots=slots)
     if found is not None:
         raise ValueError(f"pde: {found}")
-
-
-def _check_collocated(groups: list[Group], fields: int) -> None:
-    """A particle of SSPH states its equations or its conditions, as many of either as there are fields."""
-    for group in groups:
-        count = len(group.held) + group.n_rows
-        if count not in (0, fields) and len(group.held) < fields:
-            raise ValueError(
-                f"bcs[{group.name!r}]: {count} condition(s) for {fields} field(s), but method SSPH puts a condition in "
-                f'the place of every equation there and takes {fields}, or none (js.free()); use method="S"'
-            )
 
 
 def sorted_classes(disc: Discretization, ids: np.ndarray, stencils: Stencils) -> list[Class]:

@@ -356,3 +356,14 @@ def _spread(coefs: list[Any], values: list[Any], places: list[np.ndarray], n_slo
     spread = [coef @ (place[:, None] == np.arange(n_slots)).astype(coef.dtype) for coef, place in zip(coefs, places)]
     xp = jnp if is_traced(coefs, values) or any(isinstance(v, jax.Array) for v in coefs + values) else np
     return xp.concatenate(spread, axis=1), xp.concatenate(values, axis=1)
+
+
+def check_collocated(groups: list[Group], fields: int) -> None:
+    """A particle of SSPH states its equations or its conditions, as many of either as there are fields."""
+    for group in groups:
+        count = len(group.held) + group.n_rows
+        if count not in (0, fields) and len(group.held) < fields:
+            raise ValueError(
+                f"bcs[{group.name!r}]: {count} condition(s) for {fields} field(s), but method SSPH puts a condition in "
+                f'the place of every equation there and takes {fields}, or none (js.free()); use method="S"'
+            )

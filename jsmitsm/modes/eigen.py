@@ -75,7 +75,8 @@ def eigen(
         The degree of the expansions. Errors of values fall as the spacing to the power of the order, or faster.
     depth : int or "auto"
         Degrees beyond the order of the recursion and of the fit of the source. "auto" is 2 in 1D and 2D, where it
-        gains a factor of 30 to 400, about as much as two orders more do; 0 in 3D.
+        gains a factor of 30 to 400, about as much as two orders more do; 0 in 3D and on clouds
+        of too few particles for it.
     stencils : Stencils, optional
         From ``js.stencils``; needed where JAX traces the points.
     throw : bool

@@ -19,6 +19,7 @@ from jsmitsm.runtime.progress import PENCIL, bar
 from jsmitsm.solution.look.between import same_everywhere
 from jsmitsm.solution.look.gaps import gaps
 from jsmitsm.solution.look.halfway import WAYS, around
+from jsmitsm.solution.look.layers import across_layers
 from jsmitsm.solution.solution import Solution
 from jsmitsm.taylor.multi_indices import HIGHEST
 
@@ -27,9 +28,14 @@ _OUTLIER = 4.0
 
 
 def conditions(question: Question, found: Pairs) -> np.ndarray:
-    """The condition numbers (k,) of the values: the sizes of both vectors where their product is one."""
+    """The condition numbers (k,) of the values: the sizes of both vectors where their product is one.
+
+    Field by field, so that the units in which one is given do not count.
+    """
     dual = question.inert.host_transposed @ found.left
-    return np.linalg.norm(found.right, axis=0) * np.linalg.norm(dual, axis=0)
+    field = question.pencil.free % question.problem.fields
+    each = [np.flatnonzero(field == k) for k in np.unique(field)]
+    return sum(np.linalg.norm(found.right[at], axis=0) * np.linalg.norm(dual[at], axis=0) for at in each)
 
 
 @bar("error estimate", parts=PENCIL)
@@ -61,7 +67,7 @@ def unseen(question: Question, found: Pairs, mode: Callable[[int], Solution]) ->
     """By how much values (k,) may be off for what rows of all orders miss alike, in one region.
 
     mode: those between the particles, which solve L u - lambda mass u = 0. Halfway to their neighbours polynomials miss
-    it by r where a coefficient or the mass jumps, which moves the value by
+    it by r where a coefficient or the mass jumps, or a layer there hardly conducts, which moves the value by
 
         y^T B r / y^T C v,
 
@@ -82,23 +88,27 @@ def unseen(question: Question, found: Pairs, mode: Callable[[int], Solution]) ->
             out[k] = max(out[k], at_ends(question, found, int(k), sol))
         if not same_everywhere(disc):
             left = found.left[:, k]
-            missed = left @ (pencil.B.host @ _left_between(sol, disc))[pencil.free]
-            out[k] = max(out[k], np.abs(missed / (left @ (question.inert.host @ values.ravel()[pencil.free]))))
+            one = left @ (question.inert.host @ values.ravel()[pencil.free])
+            for rest in _left_between(sol, disc):
+                out[k] = max(out[k], np.abs(left @ (pencil.B.host @ rest)[pencil.free] / one))
     for cluster in np.unique(found.cluster):
         at = found.cluster == cluster
         out[at] = out[at].max()
     return out
 
 
-def _left_between(sol: Solution, disc: Discretization) -> np.ndarray:
-    """What polynomials leave of the equation halfway to their neighbours, at the particles (N F,)."""
+def _left_between(sol: Solution, disc: Discretization) -> list[np.ndarray]:
+    """What polynomials leave of the equation halfway to their neighbours, and what layers there that hardly conduct
+    make them miss, at the particles (N F,)."""
     fitted = np.asarray(sol.coefficients, float).reshape(len(sol.cloud), disc.rec.fields, -1)
     fitted = np.concatenate([fitted, fitted[disc.images.owner]])
     left = lambda ids, there, offset: residual(disc, sol._fit.problem, there, offset, fitted[ids])
-    ids, mean = around(disc, disc.classes, left, WAYS[disc.rec.dim])
-    rest = np.zeros((len(sol.cloud), disc.rec.fields))
-    rest[ids] = mean.T
-    return rest.ravel()
+    found = [around(disc, disc.classes, left, WAYS[disc.rec.dim])]
+    found.append(across_layers(disc, sol._fit.problem, lambda: fitted))
+    rests = np.zeros((2, len(sol.cloud), disc.rec.fields))
+    for rest, (ids, mean) in zip(rests, found):
+        rest[ids] = mean.T
+    return list(rests.reshape(2, -1))
 
 
 def _other_order(question: Question) -> Pencil | None:

@@ -22,7 +22,7 @@ from jsmitsm.parallel.solving import check_asked, recipe
 from jsmitsm.parallel.team import collective, team
 from jsmitsm.particle.kernels import Kernel
 from jsmitsm.solution.arguments import Depth
-from jsmitsm.solution.kept_matrix import refuse_other, same_matrix
+from jsmitsm.solution.kept_matrix import refuse_nonlinear, refuse_other, same_matrix
 
 
 class ParallelFactorization:
@@ -73,6 +73,7 @@ class ParallelFactorization:
             )  # fmt: skip
             if disc.scheme != old.disc.scheme or not np.array_equal(disc.held, old.disc.held):
                 refuse_other()
+            refuse_nonlinear(disc)
         local = copy(old)
         local.problem, local.disc = problem, replace(disc, classes=old.disc.classes)
         with us.phase(slab.number):

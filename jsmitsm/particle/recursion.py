@@ -41,6 +41,7 @@ class Recursion:
     levels : per equation, the power of length that makes its leading terms free of units.
     weights : per field, the power of length that balances it against the others
         (a pressure counts one derivative less than a velocity).
+    sizes : per field, the unit in which it is taken, where fields differ in size by much; empty where they do not.
     degrees : per equation, the highest degree of residual coefficients that is set to zero.
     """
 
@@ -53,6 +54,7 @@ class Recursion:
     degrees: tuple[int, ...]
     pattern: tuple[tuple[bool, ...], ...]
     depth: int = 0
+    sizes: tuple[float, ...] = ()
 
     @property
     def reach(self) -> int:
@@ -240,17 +242,20 @@ def constraints(rec: Recursion, jac: Any, length: Any, xp: Any = jnp) -> tuple[A
 
     jac (E, S, T): Taylor coefficients of the operator's coefficients (T = 1 if constant);
     length: scalar scale. Returns C (rows, F K) with rows of unit length, the factors (rows,)
-    that turn the Taylor coefficients of the source into the right-hand side, and ``field_units`` (F,).
+    that turn the Taylor coefficients of the source into the right-hand side, and the fields' units (F,).
     """
     powers = _powers(rec, jac.shape[-1])
     scaled = jac * (length ** xp.arange(int(powers.max()) + 1))[powers]
     matrix = _scattered(rec, scaled, np) if xp is np else _gathered(rec, scaled)
+    sizes = np.array(rec.sizes or [1.0] * rec.fields)
+    if rec.sizes:
+        matrix = matrix * np.repeat(sizes, rec.size)
     units = field_units(rec, matrix, xp)
     if any(rec.weights):
         matrix = matrix * xp.repeat(units, rec.size)
     square = xp.sum(matrix**2, axis=1)
     norm = xp.sqrt(xp.where(square > 0, square, 1.0))  # an empty row has a derivative too
-    return matrix / norm[:, None], row_lifts(rec, length, xp) / norm, units
+    return matrix / norm[:, None], row_lifts(rec, length, xp) / norm, units * sizes if rec.sizes else units
 
 
 def field_units(rec: Recursion, matrix: Any, xp: Any = jnp) -> Any:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm.cloud.cloud import Cloud
-from jsmitsm.cloud.quadrature import quadrature
+from jsmitsm.cloud.quadrature import rule
 from jsmitsm.runtime.arrays import ArrayLike, ValueOrFunction
 from jsmitsm.runtime.errors import explaining, is_whole, refuse_no_switch
 from jsmitsm.runtime.tracers import Copied, frozen, is_traced
@@ -225,7 +225,7 @@ class Anywhere(Copied):
         0.333333333333
         """
         self.refuse_stacked()
-        points, weights, _ = quadrature(self.cloud, group, self.order)
+        points, weights, _ = rule(self.cloud, group, self.order, self._recipe.otherwise)
         return jnp.tensordot(weights, self(points, outside="extrapolate"), axes=1)
 
     @explaining
@@ -262,7 +262,7 @@ class Anywhere(Copied):
         6.0
         """
         self.refuse_stacked()
-        points, weights, normals = quadrature(self.cloud, group, self.order)
+        points, weights, normals = rule(self.cloud, group, self.order, self._recipe.otherwise)
         if callable(conductivity):
             conductivity = jax.vmap(conductivity)(points)
         elif not is_traced(conductivity) and np.asarray(conductivity).dtype.kind not in "iuf":

@@ -290,7 +290,7 @@ def comparable(disc: Discretization, nums: Numbers) -> Any:
     As they are in the local fits, at the mean spacing; the median of some particles.
     """
     rec = disc.rec
-    if not any(rec.weights) or is_traced(nums.jac, disc.cloud.points):
+    if not (any(rec.weights) or rec.sizes) or is_traced(nums.jac, disc.cloud.points):
         return 1.0
     jac, length = np.asarray(nums.jac)[:, :, :1], mean_spacing(disc)
     some = np.linspace(0, jac.shape[-1] - 1, min(jac.shape[-1], LOOKED_AT)).astype(int)

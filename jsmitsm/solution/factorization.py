@@ -23,7 +23,7 @@ from jsmitsm.runtime.progress import SOLVE, bar
 from jsmitsm.runtime.tracers import is_traced
 from jsmitsm.solution.arguments import Depth, Formulation, Method, check, discretized, of_regions
 from jsmitsm.solution.fit import Fit, Recipe
-from jsmitsm.solution.kept_matrix import KeptMatrix, refuse_other, same_matrix
+from jsmitsm.solution.kept_matrix import KeptMatrix, refuse_nonlinear, refuse_other, same_matrix
 from jsmitsm.solution.regions.factorization import RegionsFactorization
 from jsmitsm.solution.run import Run
 from jsmitsm.solution.solution import Solution
@@ -98,6 +98,7 @@ class Factorization(KeptMatrix):
         alike = replace(disc.scheme, carried=old.scheme.carried)  # convection may be stronger now
         if alike != old.scheme or not np.array_equal(disc.held, old.held):
             refuse_other()
+        refuse_nonlinear(disc)
         problem = disc.problem
         nums = numbers(disc, problem)
         if not same_matrix(nums, self._nums) or disc.scheme.method in ("I", "II"):
@@ -183,6 +184,5 @@ def factorize(
             formulation=formulation, solver=solver, depth=depth,
         )  # fmt: skip
     disc = discretized(problem, cloud, method, order, kernel, stencils, basis_terms, formulation, solver, depth)
-    if not disc.linear:
-        raise ValueError("problem: it is nonlinear, so its matrix changes in every step; use js.solve")
+    refuse_nonlinear(disc)
     return Factorization(disc, problem, solver, kernel is None and stencils is None, formulation)

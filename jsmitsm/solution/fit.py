@@ -29,6 +29,7 @@ class Recipe:
     fields: int
     depth: int = 0
     operator_orders: tuple[int, ...] = ()
+    otherwise: bool = False  # whether integrals take the other rule, by which their error is told
 
     @property
     def reach(self) -> int:

@@ -109,22 +109,22 @@ def flags(run: Any, values: Any, nums: Any, estimated: Callable[[], float], know
     singular = found.get("excess", 0.0) > SINGULAR[run.formulation]
     # Near a resonance the last digits of the source decide, and the estimate passes through the same inverse.
     resonant = singular and found.get("source", 0.0) > OVERWHELMING
-    blind = found.get("excess", 0.0) > BLIND or found.get("coefficient", 0.0) > DIVERGENT
-    if certain or resonant or blind or hopeless(found):
+    blind = found.get("excess", 0.0) > BLIND or hopeless(found)
+    if certain or resonant or blind:
         return doubts + certain, found
     if particles(run.disc) > MANY and not known:
         return doubts, found
     cleared = _cleared(run, values, found, doubts)
     if not cleared:
         found["estimate"] = estimated()
-        least, most = _clearing(found, run.disc.rec.order)
+        least, most = clearing(found, run.disc.rec.order)
         if not least <= found["estimate"] <= most:
             return [*doubts, *out_of_reach(run, values, found), *data(run, values, found)], found
     # Near a resonance any residual grows without bound, that of the truncation too; the estimate has its signs.
     return [] if singular else unseen(run, values, found, cleared, found.get("source", 0.0) > SOURCE), found
 
 
-def _clearing(found: dict[str, float], order: int) -> tuple[float, float]:
+def clearing(found: dict[str, float], order: int) -> tuple[float, float]:
     """The least and the largest estimated error that clear a solution of its doubts."""
     least = BLINDLY * found.get("misfit", 0.0) if found.get("misfit", 0.0) > MISFIT else 0.0
     if found.get("turned"):
@@ -151,8 +151,9 @@ def too_large(part: float) -> list[str]:
 
 
 def hopeless(found: dict[str, float]) -> bool:
-    """Whether the local fits miss so much that no estimate is a judge of it."""
-    return found.get("misfit", 0.0) > (MISFIT if found["peclet"] > CARRIED else HOPELESS_MISFIT)
+    """Whether the local fits, or the series of a coefficient, miss so much that no estimate is a judge of it."""
+    missed = found.get("misfit", 0.0) > (MISFIT if found["peclet"] > CARRIED else HOPELESS_MISFIT)
+    return missed or found.get("coefficient", 0.0) > DIVERGENT
 
 
 def _cleared(run: Any, values: np.ndarray, found: dict[str, float], doubts: list[str]) -> bool:
@@ -394,6 +395,6 @@ def unsettled(run: Any, values: np.ndarray, nums: Any, out: list[str], found: di
 
 DOUBTS = (_condition, _misfit, _waves, _roughness, _source, _coefficients, _weakness, _peclet, _turned, _poles,
           unsettled)  # fmt: skip
-# The tests that ask the whole system, and those that ask one region of several alone.
+# The tests that ask the whole system, and those that ask one region of several alone: certain ones, and doubts.
 OF_THE_WHOLE = (_round_off, _condition, _far_away)
-OF_A_REGION = (_jumps, _contradictions, _misfit, _waves, _roughness, _coefficients, _peclet, _turned, _poles)
+OF_A_REGION = (_jumps, _contradictions), (_misfit, _waves, _roughness, _coefficients, _peclet, _turned, _poles)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any, Literal
 
 from jsmitsm.cloud.cloud import Cloud
@@ -184,8 +185,11 @@ def recipe_of(run: Run) -> Recipe:
     )  # fmt: skip
 
 
-def with_extras(problem: Problem, cloud: Cloud, *, order: Any, **options: Any) -> Solution:
-    """The solution of a problem with constraints, complex values or point sources; options as those of ``js.solve``."""
+def with_extras(problem: Problem, cloud: Cloud, *, order: Any, otherwise: bool = False, **options: Any) -> Solution:
+    """The solution of a problem with constraints, complex values or point sources; options as those of ``js.solve``.
+
+    otherwise: whether integrals take the rule by which the error of the usual one is told.
+    """
     assert problem.extras is not None
     several = of_regions(problem, cloud)
     if problem.extras.complex_values:
@@ -215,7 +219,7 @@ def with_extras(problem: Problem, cloud: Cloud, *, order: Any, **options: Any) -
     def again(order: int, unknowns: Any, u0: Any) -> Any:
         other = {"method": "S", "depth": run.disc.rec.depth, "solver": options["solver"], "u0": u0}
         near = problem if u0 is None else problem.replace(unknowns=unknowns)
-        return solve(near, cloud, order=order, **other)._values
+        return with_extras(near, cloud, order=order, otherwise=True, **other)._values
 
-    recipe = regions_recipe(run) if several else recipe_of(run)
+    recipe = replace(regions_recipe(run) if several else recipe_of(run), otherwise=otherwise)
     return solve_constrained(problem, run, recipe, again, begun(problem, options["u0"]))

@@ -79,7 +79,7 @@ def test_a_string_that_goes_on_and_on(last):
     assert 0.8 < ratio < 1.25
 
 
-@pytest.mark.parametrize("n", [21, 31, 51])
+@pytest.mark.parametrize("n", [21, 31])
 def test_a_start_that_jumps(n):
     """A hot disk in an insulated box: at the end its heat is spread evenly, what the particles have of it."""
     box = js.rectangle((0, 0), (1, 1), (n, n))
@@ -165,8 +165,9 @@ OPERATORS = {
 }
 
 
-@pytest.mark.parametrize("name", OPERATORS)
-@pytest.mark.parametrize("order", [4, 6])
+@pytest.mark.parametrize(
+    "name, order", [*((name, 4) for name in OPERATORS), ("1 + u", 6), ("in time and space", 6)]
+)
 def test_highest_derivatives_that_change(name, order):
     """The pencil of two orders more changes as that of the run does."""
     exact, op = lambda x, t: 1.5 + jnp.sin(6.0 * x[0]) * jnp.cos(3.0 * t), OPERATORS[name]
@@ -291,8 +292,10 @@ def test_a_field_from_zero_that_another_makes():
 SEAM = {"left": js.periodic("left", "right")}
 
 
-@pytest.mark.parametrize("n", [41, 81])
-@pytest.mark.parametrize("name", ["source", "wave", "reaction", "capacity", "square", "start"])
+@pytest.mark.parametrize(
+    "name, n",
+    [("source", 41), ("source", 81), ("wave", 41), ("reaction", 41), ("capacity", 41), ("square", 41), ("start", 41)],
+)
 def test_what_jumps_across_the_seam_of_a_periodic_pair(name, n):
     """A saw's teeth, which no order sees: the error falls with the spacing alone. Compared with a finer cloud."""
     heat = lambda u, x: js.dt(u)(x) - 0.2 * js.laplacian(u)(x)

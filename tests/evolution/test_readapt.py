@@ -39,19 +39,25 @@ def off(run, exact):
     return found
 
 
-@pytest.mark.parametrize("make, spacing", [(line, 0.01), (square, 0.045), (ball, 0.45)], ids=["1D", "2D", "3D"])
-def test_polynomials_stay_exact_on_clouds_that_change(make, spacing):
-    exact = lambda x, t: (1.0 + t) * (x[0] ** 3 - x[0] * x[-1] + 1.0)  # noqa: E731
+@pytest.mark.parametrize(
+    "make, spacing, order", [(line, 0.01, 4), (square, 0.045, 4), (ball, 0.8, 2)], ids=["1D", "2D", "3D"]
+)
+def test_polynomials_stay_exact_on_clouds_that_change(make, spacing, order):
+    """In three dimensions at order 2, from too few particles for an error to be told."""
+    degree = min(order, 3)
+    exact = lambda x, t: (1.0 + t) * (x[0] ** degree - x[0] * x[-1] + 1.0)  # noqa: E731
     cloud = make(spacing)
     run = js.evolve(
         js.Problem(diffused(exact), held(cloud, exact)), cloud, lambda x: exact(x, 0.0), (0.0, 1.0), steps=8,
-        readapt=js.Readapt(make, 1e-6, times=4), save=2,
+        order=order, readapt=js.Readapt(make, 1e-6, times=4), save=2,
     )  # fmt: skip
     assert run.reached and run.converged and not run.flags and run.t.tolist() == [0.0, 0.5, 1.0]
     assert off(run, exact) < 1e-9 and run.error < 1e-8
     assert len(run.parts) == 4
     if len(cloud) > 400 or cloud.dim == 1:
         assert len(run.cloud) < 0.8 * len(cloud)  # where nothing is missed it coarsens
+    if cloud.dim == 3:
+        assert len(run.cloud) > 4 * len(cloud)
     middle = np.asarray(run.at(0.4).cloud.points)
     assert np.abs(run.at(0.4).u - jax.vmap(lambda x: exact(x, 0.4))(middle)).max() < 1e-9
 
@@ -203,7 +209,7 @@ def test_the_error_of_a_wave_travels_with_it(order):
     cloud = js.interval(0.0, 1.0, 161)
     run = js.evolve(
         js.Problem(WAVE.pde, held(cloud, exact)), cloud,
-        (lambda x: exact(x, 0.0), lambda x: jax.grad(exact, 1)(x, 0.0)), (0.0, 0.4), steps=100, order=order, save=2,
+        (lambda x: exact(x, 0.0), lambda x: jax.grad(exact, 1)(x, 0.0)), (0.0, 0.4), steps=50, order=order, save=2,
     )  # fmt: skip
     true = [np.abs(jax.vmap(lambda x, t=t: exact(x, t))(cloud.points) - u).max() for t, u in zip(run.t, run.u)]
     told = np.asarray(run.error_estimate()).max(axis=1)

@@ -338,3 +338,24 @@ def test_bad_stencils_and_numbers_of_modes(modes):
     for k in (9, 1.0, True):
         with pytest.raises(ValueError, match="k: expected the number of a mode"):
             modes(k, [[0.0, 0.0]])
+
+
+@pytest.mark.parametrize(
+    ("counts", "order", "free", "most"),
+    [((17, 17), 8, False, 1e-7), ((17, 17), 6, True, 1e-6), ((9, 25), 4, False, 1e-4), ((6, 6), 6, False, 3e-3)],
+)
+def test_lattices_with_few_lines_beside_their_walls(counts, order, free, most):
+    """Half a disc of particles lies on too few lines to fit the source on them; so does all of a stretched lattice."""
+    bcs = {side: js.neumann(0.0) if free else js.dirichlet(0.0) for side in ("right", "bottom", "top")}
+    square = js.Problem(lambda u, x: -js.laplacian(u)(x), {"left": js.dirichlet(0.0), **bcs})
+    modes = js.eigen(square, js.rectangle((0, 0), (1, 1), counts), 1, order=order)
+    exact = np.pi**2 * (0.25 if free else 2.0)
+    error = abs(float(modes.values[0]) / exact - 1)
+    assert error < most and float(modes.error_estimate()[0]) / exact < 20 * most and not modes.flags
+
+
+def test_a_depth_that_a_cloud_is_too_small_for_is_refused():
+    sides = dict.fromkeys(("left", "right", "bottom", "top"), js.dirichlet(0.0))
+    square = js.Problem(lambda u, x: -js.laplacian(u)(x), sides)
+    with pytest.raises(js.SolveError, match="too few particles in a row"):
+        js.eigen(square, js.rectangle((0, 0), (1, 1), (6, 6)), 1, order=6, depth=2)

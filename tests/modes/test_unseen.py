@@ -104,3 +104,22 @@ def test_smooth_modes_are_judged_by_two_orders_alone():
         exact = (np.pi * np.arange(1, 3)) ** 2 if exact is None else exact
         ratio = told(js.eigen(problem, cloud, 2), exact)
         assert (0.2 < ratio).all() and (ratio < 5).all()
+
+
+@pytest.mark.parametrize(("order", "jitter"), [(2, 0.0), (4, 0.0), (4, 0.2)])
+def test_the_seam_of_a_torus_is_no_gap(order, jitter):
+    pairs = {"left": js.periodic("left", "right"), "bottom": js.periodic("bottom", "top")}
+    torus = js.Problem(lambda u, x: -js.laplacian(u)(x), pairs)
+    modes = js.eigen(torus, js.rectangle((0, 0), (1, 1), (13, 13), jitter=jitter), 5, order=order)
+    error = np.abs(modes.values[1:5] - 4 * np.pi**2).max()
+    assert error < modes.error_estimate()[1] * 4 < 60 * error and not modes.flags
+
+
+@pytest.mark.parametrize("place", [0.4137, 0.988])
+def test_a_bead_on_a_ring_is_told_beside_the_seam_too(place):
+    """Half of the ring's mass; the sine that vanishes there has the value 4 pi^2, the others change."""
+    away = lambda x: (x[0] - place + 0.5) % 1.0 - 0.5
+    bead = lambda x: 1 + jnp.exp(-((away(x) / 0.003) ** 2)) / (0.003 * np.sqrt(np.pi))
+    ring = js.Problem(lambda u, x: -js.laplacian(u)(x), {"left": js.periodic("left", "right")})
+    modes = js.eigen(ring, js.interval(0.0, 1.0, 41), 3, mass=bead)
+    assert modes.error_estimate()[1:].max() > 1.0 and modes.flags

@@ -58,7 +58,7 @@ def test_polynomials_of_the_order_are_reproduced(dim, order, depth):
 
 @pytest.mark.parametrize(
     "operator, order, gain",
-    [(poisson, 4, 4), (poisson, 6, 15), (helmholtz, 4, 10), (helmholtz, 5, 10), (diffusion, 4, 10),
+    [(poisson, 4, 4), (poisson, 6, 15), (helmholtz, 5, 10), (diffusion, 4, 10),
      (quasilinear, 4, 15)],
 )  # fmt: skip
 def test_solutions_that_oscillate_gain(operator, order, gain):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from jsmitsm.cloud.cloud import Cloud
-from jsmitsm.cloud.quadrature import quadrature
+from jsmitsm.cloud.quadrature import rule
 from jsmitsm.cloud.regions.region_cloud import RegionCloud
 from jsmitsm.runtime.errors import explaining, is_whole
 from jsmitsm.taylor.multi_indices import count, multi_indices
@@ -51,21 +51,22 @@ def node_weights(cloud: Cloud, degree: int = 4) -> np.ndarray:
         raise ValueError(f"cloud: expected a js.Cloud, got {type(cloud).__name__}")
     if not is_whole(degree, 1):
         raise ValueError(f"degree: expected a whole number from 1, got {degree!r}")
-    return _weights(cloud, int(degree))
+    return weights_by(cloud, int(degree))
 
 
-def _weights(cloud: Cloud, degree: int) -> np.ndarray:
+def weights_by(cloud: Cloud, degree: int, otherwise: bool = False) -> np.ndarray:
+    """The weights of ``node_weights``; otherwise: by another rule, whose difference tells the error of the first."""
     if isinstance(cloud, RegionCloud):
         out = np.zeros(len(cloud))
         for name, ids in cloud.regions.items():
-            out[ids] = _weights(cloud.region(name), degree)
+            out[ids] = weights_by(cloud.region(name), degree, otherwise)
         return out
     from scipy.spatial import cKDTree
 
     points, dim = np.asarray(cloud.points, float), cloud.dim
     while degree > 1 and _neighbours(dim, degree) > len(points):
         degree -= 1
-    at, weight, _ = quadrature(cloud, None, degree)
+    at, weight, _ = rule(cloud, None, degree, otherwise)
     tree = cKDTree(points)
     nearest = tree.query(at)[1]
     used, place = np.unique(nearest, return_inverse=True)

@@ -13,6 +13,7 @@ import numpy as np
 
 from jsmitsm.cloud.neighbours import Stencils, nearest, within
 from jsmitsm.cloud.sight.ways import Looked, Ways
+from jsmitsm.runtime.errors import some
 
 # A particle is in front of another at a smaller angle (its cosine) to the normal than this.
 _FACING, _CUT = 0.5, 0.3
@@ -31,6 +32,8 @@ _COVER = {1: 1.0, 2: 0.6, 3: 0.75}
 _SMALL, _PART = 4000, 0.25
 # A boundary particle has a side: the interior ones next to it lie in one direction (the mean's length).
 _SIDED = 0.35
+# An interior particle is behind a boundary particle if it has this part of all weights, of the inverse fourth powers.
+_BEHIND = 0.02
 
 
 class Walls:
@@ -149,7 +152,7 @@ class Walls:
         return out
 
     def check_outward(self, table: np.ndarray) -> None:
-        """Refuse a group most of whose normals point to the interior particles: ValueError.
+        """Refuse normals that point to the interior particles, of most of a group or plainly: ValueError.
 
         table (M, w): the neighbours of all particles, hidden ones too.
         """
@@ -161,16 +164,28 @@ class Walls:
             near = table[ids]
             inner = (near >= 0) & self.interior[near]
             offset = self.points[np.maximum(near, 0)] - self.points[ids][:, None]
-            length = np.where(inner, np.linalg.norm(offset, axis=2), 1.0)
-            weight = np.where(inner, (length.min(axis=1, where=inner, initial=np.inf)[:, None] / length) ** 4, 0.0)
-            height = np.einsum("bkd,bd->bk", offset, normal) / length
-            mean = (weight * height).sum(axis=1) / np.maximum(weight.sum(axis=1), 1e-300)
-            inward = mean > 0.3
-            if 2 * inward.sum() > len(ids):
+            length = np.linalg.norm(offset, axis=2)
+            height = np.einsum("bkd,bd->bk", offset, normal) / np.where(length > 0, length, 1.0)
+            closest = length.min(axis=1, where=inner, initial=np.inf)
+            weight = np.where(inner, (closest[:, None] / np.where(inner, length, 1.0)) ** 4, 0.0)
+            weight /= np.maximum(weight.sum(axis=1), 1e-300)[:, None]
+            inward = (weight * height).sum(axis=1) > 0.3
+            many = 2 * inward.sum() > len(ids)
+            if not many:
+                # One by one it is told where no interior particle lies behind, and no other wall stands before those in
+                # front: across a slit or a gap lie particles of the other side.
+                behind = (weight * np.maximum(-height, 0.0)).sum(axis=1) > _BEHIND
+                wall = (near >= 0) & ~inner & (height > _CUT) & (length < closest[:, None])
+                inward &= ~behind & ~wall.any(axis=1)
+            if inward.any():
+                those = "normals are outward, turn them round (cloud.replace(normals=-cloud.normals))"
+                if not inward.all():
+                    those = "normals are outward, turn those round (normals[ids] *= -1, cloud.replace(normals=normals))"
                 raise ValueError(
                     f"normals: those of {int(inward.sum())} of {len(ids)} particles of the group {name!r} point into "
-                    f"the domain, first at particle {int(ids[inward.argmax()])}: interior particles lie before it; "
-                    "normals are outward, turn them round (cloud.replace(normals=-cloud.normals))"
+                    f"the domain, first at particle {int(ids[inward.argmax()])}"
+                    + (f" of {some(ids[inward])}" if 1 < inward.sum() < len(ids) else "")
+                    + f": interior particles lie before it; {those}"
                 )
 
     # -- what is seen

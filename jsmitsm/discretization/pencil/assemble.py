@@ -89,7 +89,7 @@ def assemble_pencil(
     mass (F,): which equations have a source that matters (u_t, or lambda u); all, if not given. stencils: the user's,
     which are not repaired. depth: degrees beyond the order of both the recursion and the fit of the source; "auto" is
     2 in 1D and 2D, where errors of values were 30 to 400 times smaller and no mode grew in time, 0 in 3D, where the
-    source's stencils would be too wide, and where given ones are too narrow for it.
+    source's stencils would be too wide, and where given ones are too narrow for it or the cloud has too few particles.
 
     Raises ValueError for stencils that are too narrow, SolveError for rows that determine nothing.
     """
@@ -108,7 +108,12 @@ def assemble_pencil(
     if made is not None:
         layout = Layout(disc, made.layout.classes, made.layout.fitness)
         return replace(made, held_values=nums.held, conditions=condition_values(nums), layout=layout)
-    made = pencil_of(*laid_out(disc, nums, massed), nums)
+    try:
+        made = pencil_of(*laid_out(disc, nums, massed), nums)
+    except SolveError:
+        if not free or not disc.rec.depth:
+            raise
+        return assemble_pencil(problem, cloud, order=order, mass=mass, stencils=stencils, depth=0, taylor=taylor)
     layout = Layout(None, made.layout.classes, made.layout.fitness)  # without the cloud, which must not live by it
     kept.keep(disc, nums, massed, replace(made, held_values=None, conditions=None, layout=layout))
     return made
@@ -161,7 +166,8 @@ def _far(disc: Discretization, cls: Class) -> np.ndarray:
     """The neighbours of a class whose sources take part."""
     if disc.given_stencils:
         return _given(disc, cls)
-    return source_stencils(disc, cls.ids, source_stencil_size(disc.rec, cls.neighbours.shape[1]))
+    size = source_stencil_size(disc.rec, cls.neighbours.shape[1])
+    return source_stencils(disc, cls.ids, size, disc.rec.degree, strict=disc.part is None)
 
 
 def _given(disc: Discretization, cls: Class) -> np.ndarray:

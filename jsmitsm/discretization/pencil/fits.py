@@ -72,6 +72,6 @@ def local_fits(disc: Any, degree: int, alone: bool = False) -> LocalFits:
     points = np.asarray(disc.cloud.points)
     size = min(2 * count(disc.rec.dim, degree), len(points))
     ids = np.flatnonzero(disc.partner == np.arange(len(points)))
-    near = source_stencils(disc, ids, size)[np.searchsorted(ids, disc.partner)]
+    near = source_stencils(disc, ids, size, degree)[np.searchsorted(ids, disc.partner)]
     owner = np.concatenate([np.arange(len(points)), disc.images.owner]).astype(int)
     return LocalFits(np.asarray(disc.points), near, disc.partner[owner], degree, alone)

@@ -12,6 +12,7 @@ from jsmitsm.cloud.sight.walls import nearest_seen
 from jsmitsm.discretization.coefficients import Numbers
 from jsmitsm.discretization.layout import Class, Discretization, rounded_width
 from jsmitsm.discretization.local_data import around, own_conditions
+from jsmitsm.discretization.pencil.determined import undetermined
 from jsmitsm.discretization.rows import class_rows
 from jsmitsm.discretization.sharing import in_pieces, joined, on_all_cores
 from jsmitsm.particle import batches
@@ -19,10 +20,13 @@ from jsmitsm.particle.batches import Operands
 from jsmitsm.particle.elimination import Elimination, unconstrained
 from jsmitsm.particle.moments import Row
 from jsmitsm.particle.recursion import Recursion
+from jsmitsm.runtime.errors import SolveError, some
 from jsmitsm.taylor.multi_indices import multi_indices
 
 # A fit of the source's Taylor coefficients takes so many values for each of them.
 _RATIO = 2
+# Neighbours that do not determine it are taken so many times as many, until they do.
+_WIDER = (1.25, 1.5, 1.85, 2.2, 3.0, 4.0, 6.0, 8.0)
 
 
 @dataclass
@@ -44,10 +48,37 @@ def source_stencil_size(rec: Recursion, size: int) -> int:
     return max(size, _RATIO * len(multi_indices(rec.dim, rec.degree))) if rec.degree > 0 else 1
 
 
-def source_stencils(disc: Discretization, ids: np.ndarray, size: int) -> np.ndarray:
-    """The nearest particles that each of ``ids`` sees, itself first: (n, size or more)."""
+def source_stencils(
+    disc: Discretization, ids: np.ndarray, size: int, degree: int, strict: bool = False
+) -> np.ndarray:  # fmt: skip
+    """The nearest particles that each of ``ids`` sees, itself first: (n, size or more).
+
+    More of them where the nearest do not determine polynomials of this degree, as beside the walls of a lattice.
+    strict: raise SolveError where none do.
+    """
     points = disc.images.searched(np.asarray(disc.cloud.points))
-    size = min(size, len(points))
+    near = _nearest(disc, points, ids, min(size, len(points)))
+    short = undetermined(points, near, degree)
+    for factor in _WIDER:
+        if not len(short):
+            break
+        wide = _nearest(disc, points, ids[short], min(round(factor * size), len(points)))
+        lacking = np.isin(np.arange(len(short)), undetermined(points, wide, degree))
+        if not lacking.all():
+            near = widened(near, wide.shape[1])
+            near[short[~lacking]] = widened(wide[~lacking], near.shape[1])
+        short = short[lacking]
+    if strict and len(short):
+        bad = np.sort(ids[short])
+        raise SolveError(
+            f"the sources around {len(bad)} particle(s), first {some(bad)}, do not determine polynomials of degree "
+            f"{degree}: the cloud has too few particles in a row there; refine it, or lower the order or the depth",
+            [int(i) for i in bad[:100]],
+        )
+    return near
+
+
+def _nearest(disc: Discretization, points: np.ndarray, ids: np.ndarray, size: int) -> np.ndarray:
     if size == 1:
         return ids[:, None].astype(np.int32)
     if disc.rec.dim == 1:

@@ -47,8 +47,16 @@ def assemble_regions_pencil(
     stencils: Stencils | None = None, depth: int | str = 0,
 ) -> Pencil:  # fmt: skip
     """The pencil of a linear problem with several regions; arguments as of ``assemble_pencil``."""
+    if depth == "auto":
+        depth = default_depth(depth, cloud.dim)
+        try:
+            return assemble_regions_pencil(problem, cloud, order=order, mass=mass, stencils=stencils, depth=depth)
+        except SolveError:
+            if not depth:
+                raise
+        depth = 0  # a region may have too few particles for it
     near = None if stencils is None else np.asarray(stencils.indices)
-    regions = discretize_regions(problem, cloud, order, default_depth(depth, cloud.dim), near)
+    regions = discretize_regions(problem, cloud, order, int(depth), near)
     if not regions.linear:
         raise ValueError(
             "problem: an equation or a condition is nonlinear in u, but a pencil, and modes, are those of a linear "
@@ -177,7 +185,8 @@ def _sources(regions: Regions, nums: RegionNumbers, made: Joints, row: Row) -> l
         disc, local = part.disc, np.searchsorted(part.ids, ids)
         count = right_sides(disc, own, Class(local, local[:, None], replace(scheme, n_own=0)))[0].shape[1]
         near = np.asarray(disc.stencils.indices)[local]
-        far = source_stencils(disc, local, source_stencil_size(disc.rec, int((near >= 0).sum(axis=1).max())))
+        size = source_stencil_size(disc.rec, int((near >= 0).sum(axis=1).max()))
+        far = source_stencils(disc, local, size, disc.rec.degree, strict=True)
         n = len(local)
         bare = replace(disc.scheme, n_own=0, n_data=0, own=(), data=(), lost=0)
         given = Operands(np.zeros((1, 1, 1, 1)), np.zeros((n, 0, 0)), np.zeros((len(disc.points), 0, 0)), None)

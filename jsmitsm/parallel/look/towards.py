@@ -69,7 +69,7 @@ def _towards(low: Local, values: np.ndarray, taylor: Any, order: int) -> tuple[n
 
 def _units(high: Local, taylor: Any) -> Any:
     """As ``jsmitsm.solution.estimate.comparable``, the middle of what every process finds."""
-    if not any(high.disc.rec.weights):
+    if not (any(high.disc.rec.weights) or high.disc.rec.sizes):
         return 1.0
     mine = comparable(high.disc, high.numbers(high.disc, taylor))
     return np.median(high.team.gather(mine), axis=0)

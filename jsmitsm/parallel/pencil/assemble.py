@@ -41,7 +41,7 @@ def fits_miss(local: Local, ids: np.ndarray, degrees: Sequence[int]) -> float:
         return -1.0
     points = local.halo.slab.points
     size = min(2 * count(local.mine.dim, max(degrees)), len(points))
-    near = source_stencils(local.disc, ids, size)
+    near = source_stencils(local.disc, ids, size, max(degrees))
     return local.halo.short_by(_radius(points, ids, near), ids)
 
 

@@ -17,13 +17,15 @@ from jsmitsm.discretization.coefficients import Numbers, conditions_at
 from jsmitsm.discretization.layout import Class, Discretization
 from jsmitsm.discretization.least_squares import least_squares
 from jsmitsm.discretization.leave_one_out import right_side
-from jsmitsm.discretization.parts.whole import whole
+from jsmitsm.discretization.parts.whole import ALONE, Whole, whole
 from jsmitsm.discretization.periodic import with_corners
 from jsmitsm.discretization.resolution.residuals import evaluated, residual
 from jsmitsm.discretization.rows import all_coefficients, all_rows
 from jsmitsm.equation.problem import Problem
 from jsmitsm.particle.polynomials import monomials_on_host
 from jsmitsm.solution.look.halfway import WAYS, around, looked_at, pairs
+from jsmitsm.solution.look.layers import across_layers
+from jsmitsm.solution.look.sizes import NOTHING
 from jsmitsm.taylor.multi_indices import multi_indices
 
 # A particle of the same group so many times as far as the nearest ones of all, or whose normal has less than this part
@@ -43,6 +45,34 @@ def between(run: Any, values: np.ndarray) -> np.ndarray:
     if same_everywhere(disc):
         return np.zeros(disc.held.shape)
     return _made_of(run, unresolved(disc, run.nums, run.problem, run.fitted(run.nums, values)))
+
+
+def layers(run: Any, values: np.ndarray) -> np.ndarray:
+    """What layers between the particles that hardly conduct make of the solution of a run, (N, F)."""
+    disc = run.disc
+    if disc.traced.constant:
+        return np.zeros(disc.held.shape)
+    fitted, told = (lambda: run.fitted(run.nums, values)), whole(disc)
+    if disc.part is not None:
+        fitted()  # all processes at once, whichever of them has a layer
+    missed = held_up(disc, run.nums, run.problem, fitted)
+    if not told.total(int(np.any(missed.source))):
+        return np.zeros(disc.held.shape)
+    return measured(values, _made_of(run, missed), told)
+
+
+def measured(values: np.ndarray, made: np.ndarray, told: Whole = ALONE) -> np.ndarray:
+    """What is made of the solution (N, F), nothing of a field that is zero: it has no scale to measure that with."""
+    size = np.array([told.norm(told.own(v)) for v in np.asarray(values, float).T])
+    return np.where(size > NOTHING * size.max(), made, 0.0)
+
+
+def held_up(disc: Discretization, nums: Numbers, problem: Problem, fitted: Callable[[], np.ndarray]) -> Numbers:
+    """The numbers of the same operator with, for its source, what does as much as such layers (``across_layers``)."""
+    source = np.zeros((disc.rec.n_rows, len(nums.ids)))
+    ids, missed = across_layers(disc, problem, fitted)
+    source[np.array(disc.rec.equation_rows)[:, None], _places(disc, nums)[ids]] = missed
+    return with_source(nums, source)
 
 
 def same_everywhere(disc: Discretization) -> bool:
@@ -252,7 +282,7 @@ def _made_of(run: Any, nums: Numbers) -> np.ndarray:
     """The solution (N, F) of a run's system with the source and data of ``nums`` alone, its size."""
     disc = run.disc
     if run.formulation == "lsq":
-        right = least_squares(disc if disc.scheme.sourced else _sourced(disc, disc.classes), nums)[3]
+        right = least_squares(disc if disc.scheme.sourced else sourced(disc, disc.classes), nums)[3]
     else:
         right = _right(disc, nums, run.rows)
     return solved_alone(run, np.asarray(right))
@@ -263,12 +293,12 @@ def _right(disc: Discretization, nums: Numbers, made: Any) -> np.ndarray:
     classes, rows = made
     if not disc.scheme.sourced or disc.scheme.method in ("I", "II"):
         # Rows of a problem without a source lack its weights; those of I and II hold the neighbours' sources.
-        disc = _sourced(disc, classes)
+        disc = sourced(disc, classes)
         classes, rows = all_rows(disc, nums)
     return np.asarray(right_side(disc, nums, classes, rows))
 
 
-def _sourced(disc: Discretization, classes: list[Class]) -> Discretization:
+def sourced(disc: Discretization, classes: list[Class]) -> Discretization:
     """The same of a problem with a source."""
     disc = replace(disc, scheme=replace(disc.scheme, sourced=True))
     disc.classes = [replace(cls, scheme=replace(cls.scheme, sourced=True)) for cls in classes]

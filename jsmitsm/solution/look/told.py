@@ -8,7 +8,7 @@ import numpy as np
 
 from jsmitsm.discretization.parts.whole import whole
 from jsmitsm.runtime.errors import some
-from jsmitsm.solution.look.between import between, even, seam, unseen_data
+from jsmitsm.solution.look.between import between, even, layers, seam, unseen_data
 from jsmitsm.solution.look.reach import far_out, unmet
 from jsmitsm.solution.look.sizes import share
 
@@ -16,6 +16,8 @@ from jsmitsm.solution.look.sizes import share
 CLEARED = 0.02
 # ... unless what is missed between the particles would make so much of the solution, or where the source says so too.
 MISSED, AGREED = 1.0, 0.3
+# ... or layers that hold up a flux there: integrals across them, which are as they are.
+LAYERED = 0.02
 # ... or boundary data so much: seven particles a wavelength leave an eighth of the data.
 DATA = 0.3
 # ... or values that no polynomial reaches by far: above 0.27 where estimates were blind, below 0.05 of solutions right
@@ -33,14 +35,16 @@ def unseen(
     disc, every = run.disc, whole(run.disc)
     part = lambda missed: share(every.own(missed), every.own(values), told=every)
     found["missed"] = missed = 0.0 if cleared and even(run) else part(between(run, values))
+    found["layers"] = layered = part(layers(run, values))
     told = list[str]()
     # Constant coefficients degenerate nowhere, and layers that fall to nothing within the spacing may be right.
     if not (disc.linear and disc.traced.constant):
         told += out_of_reach(run, values, found, cleared)
-    if missed > (AGREED if narrow else MISSED):
+    if missed > (AGREED if narrow else MISSED) or layered > LAYERED:
         told.append(
-            f"Between the particles the equation is missed by as much as makes {missed:.0%} of the solution: the "
-            "source or a coefficient changes within the spacing, unseen by the particles; refine there, or smooth it."
+            f"Between the particles the equation is missed by as much as makes {max(missed, layered):.0%} of the "
+            "solution: the source or a coefficient changes within the spacing, unseen by the particles; refine there, "
+            "or smooth it."
         )
     return told + data(run, values, found)
 

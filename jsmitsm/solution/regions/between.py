@@ -9,19 +9,23 @@ import numpy as np
 
 from jsmitsm.discretization.coefficients import Numbers
 from jsmitsm.discretization.regions.layout import Part
-from jsmitsm.discretization.regions.rows import RegionNumbers, spread, whole_coefficients, whole_right_side
+from jsmitsm.discretization.regions.rows import RegionNumbers, in_squares, spread, whole_coefficients, whole_right_side
+from jsmitsm.discretization.rows import all_rows
 from jsmitsm.solution.look.between import (
     data_between,
     has_kinks,
+    held_up,
+    measured,
     out_of_series,
     same_everywhere,
     solved_alone,
+    sourced,
     unresolved,
     with_source,
 )
 from jsmitsm.solution.look.reach import LOST, TIMES, Misses, made_of
 from jsmitsm.solution.look.sizes import share
-from jsmitsm.solution.look.told import CLEARED, DATA, MISSED
+from jsmitsm.solution.look.told import CLEARED, DATA, LAYERED, MISSED
 
 
 def unseen(run: Any, values: np.ndarray) -> list[str]:
@@ -36,11 +40,17 @@ def unseen(run: Any, values: np.ndarray) -> list[str]:
         disc = part.disc
         return out_of_series(disc, own, disc.problem, expanded[part.ids]) if has_kinks(disc, own) else None
 
-    told = []
-    if (between := share(_made(run, left), values)) > MISSED:
+    def layers(part: Part, own: Numbers) -> Numbers | None:
+        disc = part.disc
+        return None if disc.traced.constant else held_up(disc, own, disc.problem, lambda: expanded[part.ids])
+
+    told, between = [], share(_made(run, left), values)
+    layered = share(measured(values, _made(run, layers)), values)
+    if between > MISSED or layered > LAYERED:
         told.append(
-            f"Between the particles the equations are missed by as much as makes {between:.0%} of the solution: a "
-            "source or a coefficient changes within the spacing, unseen by the particles; refine there, or smooth it."
+            f"Between the particles the equations are missed by as much as makes {max(between, layered):.0%} of the "
+            "solution: a source or a coefficient changes within the spacing, unseen by the particles; refine there, or "
+            "smooth it."
         )
     if (kinks := share(_made(run, beyond), values)) > CLEARED:
         told.append(
@@ -72,6 +82,14 @@ def _data(part: Part, own: Numbers) -> Numbers | None:
     return data_between(part.disc, own, part.disc.problem)
 
 
+def _with_sources(part: Part, own: Numbers, made: Any) -> Any:
+    """The rows of a region with the weights of a source, which those of an equation without one lack."""
+    classes, rows = made
+    if part.disc.scheme.sourced or in_squares(rows):
+        return made
+    return all_rows(sourced(part.disc, classes), own)
+
+
 def _made(run: Any, look: Callable[[Part, Numbers], Numbers | None]) -> np.ndarray:
     """What the numbers that ``look`` finds in every region, None for nothing, make of the solution, (N, F)."""
     disc, nums = run.disc, run.nums
@@ -81,5 +99,6 @@ def _made(run: Any, look: Callable[[Part, Numbers], Numbers | None]) -> np.ndarr
     alone = [with_source(own, np.zeros_like(own.source)) if new is None else new for own, new in zip(nums.parts, found)]
     between = {name: (coef, np.zeros_like(value)) for name, (coef, value) in nums.between.items()}
     held = spread(disc, [own.held for own in alone], disc.held.shape)
-    right = whole_right_side(disc, RegionNumbers(alone, between, held), run.parts, run.bound)
-    return solved_alone(run, np.asarray(right))
+    rows = [_with_sources(part, own, made) for part, own, made in zip(disc.parts, nums.parts, run.parts)]
+    right = whole_right_side(disc, RegionNumbers(alone, between, held), rows, run.bound)
+    return solved_alone(run, np.asarray(right)) if right.any() else np.zeros(disc.held.shape)

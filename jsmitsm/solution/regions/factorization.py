@@ -11,9 +11,12 @@ import numpy as np
 from jsmitsm.discretization.leave_one_out import with_held
 from jsmitsm.discretization.regions.layout import discretize_regions
 from jsmitsm.discretization.regions.rows import RegionNumbers, region_numbers, whole_right_side, whole_table
+from jsmitsm.equation.unknowns.extras import refuse_extras
+from jsmitsm.runtime.errors import explaining
 from jsmitsm.runtime.progress import bar
 from jsmitsm.runtime.tracers import is_traced
-from jsmitsm.solution.kept_matrix import KeptMatrix, refuse_other, same_matrix
+from jsmitsm.solution.arguments import check, of_regions
+from jsmitsm.solution.kept_matrix import KeptMatrix, refuse_nonlinear, refuse_other, same_matrix
 from jsmitsm.solution.regions.run import RegionsRun
 from jsmitsm.solution.regions.solution import RegionsSolution
 from jsmitsm.solution.regions.solve import finished_regions, prepared_regions
@@ -45,11 +48,11 @@ class RegionsFactorization(KeptMatrix):
     def __init__(self, problem: Any, cloud: Any, **options: Any):
         self._options = options
         self._run = prepared_regions(problem, cloud, sources=True, **options)
-        if not self._run.disc.linear:
-            raise ValueError("problem: it is nonlinear, so its matrix changes in every step; use js.solve")
+        refuse_nonlinear(self._run.disc)
         self._nums = self._run.numbers()
         super().__init__(self._run.assembled(self._nums)[:3])
 
+    @explaining
     @bar("solve")
     def solve(self, problem: Any) -> RegionsSolution:
         """The solution of a problem with the same operators; sources and values of conditions may differ.
@@ -72,11 +75,15 @@ class RegionsFactorization(KeptMatrix):
             As ``js.solve`` does.
         """
         old = self._run.disc
+        check(problem, old.cloud, "S", old.rec.order, None, None)
+        of_regions(problem, old.cloud)
+        refuse_extras(problem)
         disc = discretize_regions(problem, old.cloud, old.rec.order, old.rec.depth, whole_table(old), sources=True)
         if not np.array_equal(disc.held, old.held) or [p.disc.scheme for p in disc.parts] != [
             p.disc.scheme for p in old.parts
         ]:
             refuse_other()
+        refuse_nonlinear(disc)
         disc.contrast, disc.squared = old.contrast, old.squared
         nums = region_numbers(disc)
         if not same_matrix(nums, self._nums):

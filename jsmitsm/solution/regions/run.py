@@ -202,17 +202,21 @@ class RegionsRun(Run):
             test(self, values, self.nums, certain, found)
         doubts: list[str] = []
         flags.unsettled(self, values, self.nums, doubts, found)
-        told: list[str]
+        bounds = [(0.0, flags.CLEARED)]
         for part, own, rows in zip(self.disc.parts, self.nums.parts, self.parts):
-            told, found = [], {}
+            sure, told, found = list[str](), list[str](), {}
             view = copy(self)
             view.disc, view.rows, view.nums = part.disc, rows, own
             if part.name in self.squared:
                 view._missed = relative_misfit(part.disc, own, values[part.ids], list(zip(*rows)))
-            for test in flags.OF_A_REGION:
-                test(view, values[part.ids], own, told, found)
-            told = [f"In the region {part.name!r}: {line[0].lower()}{line[1:]}" for line in told]
+            for tests, lines in zip(flags.OF_A_REGION, (sure, told)):
+                for test in tests:
+                    test(view, values[part.ids], own, lines, found)
+            sure, told = ([f"In the region {part.name!r}: {a[0].lower()}{a[1:]}" for a in lines]
+                          for lines in (sure, told))  # fmt: skip
+            certain += sure
             (certain if flags.hopeless(found) else doubts).extend(told)
+            bounds.append(flags.clearing(found, self.disc.rec.order))
         told = [*weak_copies(self.bound), *singular(self.disc, values)]
         asked = known or len(values) <= flags.MANY
         share = estimated() if asked else np.inf
@@ -221,7 +225,7 @@ class RegionsRun(Run):
                 f"The region(s) {sorted(self.squared)} take the least-squares form, whose error no other order can "
                 "tell here: compare with a finer cloud."
             )
-        cleared = share <= flags.CLEARED
+        cleared = max(least for least, _ in bounds) <= share <= min(most for _, most in bounds)
         if cleared and not certain:
             told += unseen(self, values)
         return [*certain, *([] if cleared else doubts), *told, *self.against]

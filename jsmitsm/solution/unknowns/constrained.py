@@ -36,7 +36,8 @@ Again = Callable[[int, dict[str, Any], Any], Any]
 
 
 class Compared:
-    """A fit whose error estimate is the distance to the solution of another order, unknowns and all."""
+    """A fit whose error estimate is the distance to the solution of another order, unknowns and all; its integrals take
+    another rule too, or what both orders' rules miss alike would go untold."""
 
     recipe: Recipe
     again: Callable[[int], Any] | None = None  # the values at another order
@@ -84,7 +85,7 @@ def solve_constrained(
     start = floats(problem.extras.unknowns)
     _check(problem, run)
     if run.term is not None:
-        run.term.weigh(run.disc.cloud, recipe.order)
+        run.term.weigh(run.disc.cloud, recipe.order, recipe.otherwise)
         run.solver = "dense" if run.solver == "auto" else run.solver
     run.multipliers = not start and run.term is None
     answer = _response(run, start) if run.disc.linear else None

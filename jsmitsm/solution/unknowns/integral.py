@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jsmitsm.cloud.quadrature import Quadrature, quadrature
-from jsmitsm.cloud.regions.node_weights import node_weights
+from jsmitsm.cloud.regions.node_weights import weights_by
 from jsmitsm.equation.problem import Problem
 from jsmitsm.equation.unknowns.integral import recorded_kernel
 from jsmitsm.particle.recursion import Recursion, source_rows
@@ -71,9 +71,9 @@ class IntegralTerm:
         self.block: Any = np.zeros((0, 0))  # what the matrix gets, (n, n), once assembled
         self._known: Any = np.zeros((0, 0))  # what stands before the held values, (n, N F)
 
-    def weigh(self, cloud: Any, order: int) -> None:
-        """Find the weights that an order of the solution takes."""
-        self.weights = node_weights(cloud, order + _MORE[cloud.dim])
+    def weigh(self, cloud: Any, order: int, otherwise: bool = False) -> None:
+        """Find the weights that an order of the solution takes; otherwise: those that tell the error of its rule."""
+        self.weights = weights_by(cloud, order + _MORE[cloud.dim], otherwise)
         self.finer = quadrature(cloud, None, order)
 
     def carried(self, values: Any) -> Any:
