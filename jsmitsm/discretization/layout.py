@@ -112,11 +112,12 @@ class Discretization(Placed):
 def discretize(
     problem: Problem, cloud: Cloud, method: str, order: int, kernel: Kernel | None,
     stencils: Stencils | None, basis_terms: int | None, sources: bool = True, depth: int | str = "auto",
-    part: Part | None = None,
+    part: Part | None = None, region: bool = False,
 ) -> Discretization:  # fmt: skip
     """Trace the problem, lay out its recursion and conditions, and find neighbours.
 
     sources: whether the weights of the source are wanted even where it is zero; part: where the cloud is a part.
+    region: where it is one of several, which share fits at their interfaces, and so the units of their fields.
     """
     if isinstance(cloud, RegionCloud) or isinstance(problem.pde, PerRegion):
         raise ValueError("problem: several regions are for js.solve, js.factorize, js.evolve, js.eigen; not for this")
@@ -135,7 +136,7 @@ def discretize(
         depth = suited_depth(method, rec, flat, sourced, traced, cloud, problem.params, held, part)
         depth = depth and min(depth, room(rec, order))
     rec = recursion(cloud.dim, order, problem.fields, traced.slots, traced.pattern, traced.order, int(depth))
-    if method == "S":
+    if method == "S" and not region:
         rec = replace(rec, sizes=field_sizes(rec, traced, cloud, problem.params, groups, part))
     scheme = _scheme(method, rec, traced, problem, cloud, basis_terms)
     carried = method == "S" and bool(depth) and carries(rec, traced, cloud, problem.params, part)

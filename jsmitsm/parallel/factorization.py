@@ -73,7 +73,7 @@ class ParallelFactorization:
             )  # fmt: skip
             if disc.scheme != old.disc.scheme or not np.array_equal(disc.held, old.disc.held):
                 refuse_other()
-            refuse_nonlinear(disc)
+            refuse_nonlinear(disc, "jp.solve")
         local = copy(old)
         local.problem, local.disc = problem, replace(disc, classes=old.disc.classes)
         with us.phase(slab.number):

@@ -36,10 +36,10 @@ def same_matrix(new: Any, old: Any) -> bool:
     return not is_traced(pairs) and all(np.array_equal(np.asarray(a), np.asarray(b)) for a, b in pairs)
 
 
-def refuse_nonlinear(disc: Any) -> None:
+def refuse_nonlinear(disc: Any, verb: str = "js.solve") -> None:
     """A discretised problem, of one region or of several, whose matrix is not one and the same."""
     if not disc.linear:
-        raise ValueError("problem: it is nonlinear, so its matrix changes in every step; use js.solve")
+        raise ValueError(f"problem: it is nonlinear, so its matrix changes in every step; use {verb}")
 
 
 def refuse_other() -> NoReturn:

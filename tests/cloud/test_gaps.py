@@ -98,6 +98,17 @@ def test_inward_normals_are_refused():
     js.solve(problem, cloud)
 
 
+@pytest.mark.parametrize("turned", [[5], [5, 6], [4, 9, 14, 15]])
+def test_single_normals_that_point_inward_are_refused_by_number(turned):
+    """One of 21 is as wrong as all of them; normals at the ends of holes and slits are no such."""
+    cloud = js.rectangle((0, 0), (1, 1), (21, 21))
+    sides = {**dict.fromkeys(("left", "bottom", "top"), js.dirichlet(0.0)), "right": js.neumann(1.0)}
+    ids, normals = np.asarray(cloud.groups["right"])[turned], np.array(cloud.normals)
+    normals[ids] *= -1
+    with pytest.raises(ValueError, match=f"normals: those of {len(ids)} of .* 'right' .*first at particle {ids[0]}"):
+        js.solve(js.Problem(LOAD, sides), cloud.replace(normals=normals))
+
+
 def test_stencils_of_one_piece_stay_as_they_are():
     """Holes and blunt corners hide nobody who is near, but for some seen past the very edge of a corner."""
     ell = js.from_polygon([(0, 0), (2, 0), (2, 1), (1, 1), (1, 2), (0, 2)], 0.1)

@@ -1,11 +1,13 @@
 """Integrals over solids with edges, on which no particles stand: facets reach across them."""
 
+import pickle
 import warnings
 
 import numpy as np
 import pytest
 
 import jsmitsm as js
+from jsmitsm.cloud.quadrature import rule
 from jsmitsm.cloud.triangulation import boundary_facets
 
 CAPS = {
@@ -106,3 +108,17 @@ def test_a_particle_beyond_an_edge_says_nothing_of_the_side_it_is_on():
     same = js.Cloud(points, cloud.groups, cloud.normals)
     for group in CAPS:
         assert js.quadrature(moved, group).weights.sum() == js.quadrature(same, group).weights.sum()
+
+
+@pytest.mark.parametrize("known", [True, False])
+@pytest.mark.parametrize("degree", [2, 4])
+def test_the_other_rule_tells_the_error(known, degree):
+    """Of the area of a disk at the end of a cylinder, in the sense of a flux through it."""
+    groups = {"end": lambda x: x[:, 0] > 1 - 1e-6, "rest": lambda x: x[:, 0] <= 1 - 1e-6}
+    shape = js.sdf.cylinder((0, 0, 0), (1, 0, 0), 0.5)
+    cloud = js.from_sdf(shape, ((-0.1, -0.6, -0.6), (1.1, 0.6, 0.6)), 0.25, groups=groups)
+    cloud = cloud if known else pickle.loads(pickle.dumps(cloud))
+    own, other = rule(cloud, "end", degree), rule(cloud, "end", degree + 2, otherwise=True)
+    through, told = (q.weights @ q.normals[:, 0] for q in (own, other))
+    error = abs(through - np.pi / 4)
+    assert error > 1e-4 and error / 3 < abs(told - through) < 3 * error

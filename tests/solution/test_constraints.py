@@ -260,3 +260,42 @@ def test_a_singular_set_of_constraints_fails_by_name():
     problem = js.Problem(pde, ends, unknowns={"p": 0.0, "q": 0.0}, constraints=[same, same])
     with pytest.raises(js.SolveError, match="constraints"):
         js.solve(problem, ROD)
+
+
+def amoeba(x):
+    return jnp.hypot(x[0], x[1]) - 1.0 - 0.2 * jnp.cos(5 * jnp.arctan2(x[1], x[0]))
+
+
+AMOEBA = js.from_sdf(amoeba, ((-1.3, -1.3), (1.3, 1.3)), 0.3)
+# Of the amoeba: its area, and the integral of r^2.
+AREA, SECOND = np.pi * 1.02, np.pi / 2 * (1 + 6 * 0.04 / 2 + 0.0016 * 3 / 8)
+
+
+def bowl(constraint):
+    """u = a r^2 with a = 1, by what a constraint says of it."""
+    return js.Problem(
+        lambda u, x, g: js.laplacian(u)(x) - 4 * g["a"],
+        {"boundary": js.dirichlet(lambda x, g: g["a"] * (x @ x))},
+        unknowns={"a": 0.0}, constraints=[constraint],
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("order", [2, 4])
+@pytest.mark.parametrize(
+    "constraint",
+    [js.constraint(lambda s: s.flux("boundary"), 4 * AREA), js.constraint(lambda s: s.integral(), SECOND)],
+)
+def test_the_estimate_knows_the_error_of_the_quadrature(constraint, order):
+    """The solution is a polynomial of the order: all that it misses is the quadrature's."""
+    sol = js.solve(bowl(constraint), AMOEBA, order=order)
+    error = np.abs(np.asarray(sol.u) - (np.asarray(AMOEBA.points) ** 2).sum(axis=1)).max()
+    assert error > 1e-6 and 0.5 * error < sol.error_estimate().max() < 2.0 * error
+
+
+def test_the_estimate_knows_the_quadrature_of_an_integral_term():
+    """u - (the integral of u) = r^2."""
+    problem = js.Problem(lambda u, x: u(x) - x @ x, {"boundary": js.free()}, integral=lambda x, y: -1.0 + 0.0 * (x @ y))
+    sol = js.solve(problem, AMOEBA, order=2)
+    exact = (np.asarray(AMOEBA.points) ** 2).sum(axis=1) + SECOND / (1.0 - AREA)
+    error = np.abs(np.asarray(sol.u) - exact).max()
+    assert error > 1e-7 and sol.error_estimate().max() > 0.3 * error

@@ -112,3 +112,42 @@ def test_periodic_sides():
     cloud = js.rectangle((0, 0), (1, 1), (17, 17))
     own = js.solve(ring(2.0), cloud)
     np.testing.assert_allclose(js.factorize(ring(1.0), cloud).solve(ring(2.0)).u, own.u, rtol=0, atol=1e-12)
+
+
+def test_other_problems_are_refused_in_words():
+    rod = js.interval(0.0, 1.0, 11)
+    ends = {"left": js.dirichlet(0.0), "right": js.dirichlet(1.0)}
+    ready = js.factorize(js.Problem(lambda u, x: js.laplacian(u)(x) - u(x), ends), rod)
+    with pytest.raises(ValueError, match="it is nonlinear"):
+        ready.solve(js.Problem(lambda u, x: js.laplacian(u)(x) - u(x) ** 2, ends))
+    with pytest.raises(ValueError, match="constraints and global unknowns"):
+        ready.solve(
+            js.Problem(lambda u, x, g: js.laplacian(u)(x) - g["q"], ends, unknowns={"q": 0.0},
+                       constraints=[js.constraint(lambda sol: sol.integral(), 1.0)])
+        )  # fmt: skip
+    slope = {"left": js.dirichlet(0.0), "right": js.neumann(1.0)}
+    radiating = {**slope, "right": js.condition(lambda u, x, n: n @ js.grad(u)(x) + u(x) ** 4)}
+    with pytest.raises(ValueError, match="it is nonlinear"):
+        js.factorize(js.Problem(lambda u, x: js.laplacian(u)(x), slope), rod).solve(
+            js.Problem(lambda u, x: js.laplacian(u)(x), radiating)
+        )
+
+
+def test_other_problems_in_regions_are_refused_in_words():
+    layers, names = js.regions({"a": (0.0, 0.5), "b": (0.5, 1.0)}, spacing=0.125), "ab"
+    pde, flux = (lambda u, x: js.laplacian(u)(x) + 1.0), (lambda u, x, n: n @ js.grad(u)(x))
+    warm = lambda u, x, n: (1.0 + u(x) ** 2) * (n @ js.grad(u)(x))  # noqa: E731
+
+    def layered(second, **more):
+        between = js.interface(flux={"a": flux, "b": second})
+        return js.Problem(dict.fromkeys(names, pde), {"boundary": js.dirichlet(0.0), "a|b": between}, **more)
+
+    ready = js.factorize(layered(flux), layers)
+    with pytest.raises(ValueError, match="it is nonlinear"):
+        ready.solve(layered(warm))
+    with pytest.raises(ValueError, match="constraints and global unknowns"):
+        ready.solve(layered(flux, constraints=[js.constraint(lambda sol: sol.integral(), 1.0)]))
+    with pytest.raises(ValueError, match="give an equation for each"):
+        ready.solve(js.Problem(pde, {"boundary": js.dirichlet(0.0)}))
+    with pytest.raises(ValueError, match="expected a js.Problem"):
+        ready.solve(None)

@@ -170,7 +170,9 @@ def _region(
     """The discretisation of one region; whatever is wrong with it is said to be this region's."""
     own = region_of(problem, cloud, name)
     try:
-        disc = discretize(own, cloud.region(name), "S", order, None, near, None, sources=sources, depth=depth)
+        disc = discretize(
+            own, cloud.region(name), "S", order, None, near, None, sources=sources, depth=depth, region=True
+        )
     except ValueError as error:
         text = str(error)
         if text.startswith("cloud:") and "too few" in text:

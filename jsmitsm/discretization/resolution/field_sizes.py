@@ -51,9 +51,11 @@ def field_sizes(
     count = len(points) if part is None else part.count
     some = Whole(part).every(points, max(1, count // LOOKED_AT))
     halfway = 0.5 * float(np.ptp(points, axis=0).max())
-    sizes = _held(rec.fields, groups)
+    if (given := _given(rec, groups, halfway)) is None:
+        return ()
+    sizes, joined = given
     terms, source = _terms(rec, traced, some, params, sizes, halfway)
-    sizes = _made(rec, terms, source, sizes)
+    sizes = _made(rec, terms, source, sizes, joined)
     sizes = np.where((sizes > 0) & np.isfinite(sizes) & (np.array(rec.weights) == 0), sizes, np.nan)
     if not np.isfinite(sizes).any() or np.nanmax(sizes) <= ALIKE * np.nanmin(sizes):
         return ()
@@ -62,15 +64,28 @@ def field_sizes(
     return tuple(float(x) for x in np.exp2(STEP * steps)) if steps.any() else ()
 
 
-def _held(fields: int, groups: list[Group]) -> np.ndarray:
-    """The largest value (F,) that a condition holds of each field, as far as it is known."""
-    sizes = np.zeros(fields)
+def _given(rec: Recursion, groups: list[Group], length: float) -> tuple[np.ndarray, np.ndarray] | None:
+    """The largest size (F,) that conditions give to each field, and which fields (F, F) one condition speaks of.
+
+    None where a condition's numbers are not known before the solve.
+    """
+    sizes, joined = np.zeros(rec.fields), np.zeros((rec.fields,) * 2, bool)
     for group in groups:
         for k, values in group.held.items():
-            given = concrete(values())
-            if given is not None:
-                sizes[k] = max(sizes[k], _magnitudes(given).max(initial=0.0))
-    return sizes
+            if (given := concrete(values())) is None:
+                return None
+            sizes[k] = max(sizes[k], _magnitudes(given).max(initial=0.0))
+        for part in group.parts:
+            numbers = [concrete(x) for x in part.numbers(None)] if part.linear else [None]
+            if any(x is None for x in numbers):
+                return None
+            coef, value = map(_magnitudes, numbers)
+            terms = (coef * [length ** -sum(b) for _, b in part.slots]).sum(axis=-1)
+            size = np.median(value / np.where(terms > 0, terms, np.inf), axis=0).max(initial=0.0)
+            fields = sorted({f for f, _ in part.slots})
+            joined[np.ix_(fields, fields)] = True
+            sizes[fields] = np.maximum(sizes[fields], size)
+    return sizes, joined
 
 
 def _magnitudes(values: Any) -> np.ndarray:
@@ -102,7 +117,7 @@ def _terms(
     return out, source
 
 
-def _made(rec: Recursion, terms: np.ndarray, source: np.ndarray, held: np.ndarray) -> np.ndarray:
+def _made(rec: Recursion, terms: np.ndarray, source: np.ndarray, held: np.ndarray, joined: np.ndarray) -> np.ndarray:
     """The sizes (F,) of fields, from what their equations make of the sources, of the values held and of one another.
 
     Fields that drive one another without end, as the two parts of a wave do, are made no larger by that.
@@ -126,10 +141,12 @@ def _made(rec: Recursion, terms: np.ndarray, source: np.ndarray, held: np.ndarra
     gain = np.zeros((rec.fields,) * 2)
     gain[fields] = terms[equations] / own[:, None]
     gain[:, np.array(rec.weights) != 0] = 0.0
-    # The velocities of a flow are one vector.
+    # The velocities of a flow are one vector, and so is what one condition speaks of, as a traction.
+    joined = joined & np.isin(np.arange(rec.fields), free)
     for e in np.setdiff1d(np.arange(len(terms)), equations):
         together = free[terms[e, free] > 0]
-        gain[np.ix_(together, together)] = np.maximum(gain[np.ix_(together, together)], 1.0)
+        joined[np.ix_(together, together)] = True
+    gain[joined] = np.maximum(gain[joined], 1.0)
     np.fill_diagonal(gain, 0.0)
     gain /= max(1.0, float(np.abs(np.linalg.eigvals(gain)).max(initial=0.0)))
     if not sizes.any():
