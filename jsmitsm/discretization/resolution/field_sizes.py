@@ -22,12 +22,13 @@ from jsmitsm.equation.traced import Traced
 from jsmitsm.particle.recursion import Recursion
 from jsmitsm.runtime.tracers import concrete, is_traced
 
-# Fields within this ratio of one another keep their units.
-ALIKE = 10.0
+# Fields within this ratio of one another keep their units; where the problem is nonlinear, of which the boundary values
+# tell less, within the second.
+ALIKE, ALIKE_THERE = 10.0, 1e3
 # Units are powers of two to this.
 STEP = 2
 # A field that is held keeps the size of these values, unless others make it larger than them by this.
-FAR = 100.0
+FAR = 8.0
 # Particles whose coefficients are looked at.
 LOOKED_AT = 32
 
@@ -37,8 +38,8 @@ def field_sizes(
 ) -> tuple[float, ...]:
     """A unit for every field; empty where they may keep their own, and where nothing can be known beforehand.
 
-    A field is as large as its boundary values, or, where that is much more, as what the sources and the other fields
-    make of it across the domain.
+    A field is as large as its boundary values, or, in a linear problem, as what the sources and the other fields make
+    of it across the domain, where that is much more.
     """
     if rec.fields == 1:
         return ()
@@ -47,21 +48,37 @@ def field_sizes(
         return ()
     if is_traced(traced, params):  # what only carries derivatives changes nothing
         traced, params = jax.tree.map(concrete, (traced, params))
-    points = np.asarray(points)
-    count = len(points) if part is None else part.count
-    some = Whole(part).every(points, max(1, count // LOOKED_AT))
-    halfway = 0.5 * float(np.ptp(points, axis=0).max())
-    if (given := _given(rec, groups, halfway)) is None:
+    whole, points = Whole(part), np.asarray(points)
+    low, high = -whole.most(-points.min(axis=0)), whole.most(points.max(axis=0))
+    halfway = 0.5 * float((high - low).max())
+    given = _given(rec, groups, halfway)
+    if whole.most(float(given is None)):
         return ()
-    sizes, joined = given
-    terms, source = _terms(rec, traced, some, params, sizes, halfway)
-    sizes = _made(rec, terms, source, sizes, joined)
+    held, joined = map(whole.most, given or ())
+    sizes, vectors = held, _vectors(rec, joined > 0)
+    if traced.linear:
+        count = len(points) if part is None else part.count
+        some = whole.every(points, max(1, count // LOOKED_AT))
+        sizes = _made(rec, *_terms(rec, traced, some, params, halfway), held, vectors)
+    sizes = np.where(vectors, sizes, 0.0).max(axis=1)
     sizes = np.where((sizes > 0) & np.isfinite(sizes) & (np.array(rec.weights) == 0), sizes, np.nan)
-    if not np.isfinite(sizes).any() or np.nanmax(sizes) <= ALIKE * np.nanmin(sizes):
+    alike = ALIKE if traced.linear else ALIKE_THERE
+    if not np.isfinite(sizes).any() or np.nanmax(sizes) <= alike * np.nanmin(sizes):
         return ()
     # The largest keeps its unit, and so does one of which nothing is known.
     steps = np.round(np.log2(np.nan_to_num(sizes / np.nanmax(sizes), nan=1.0)) / STEP)
     return tuple(float(x) for x in np.exp2(STEP * steps)) if steps.any() else ()
+
+
+def _vectors(rec: Recursion, joined: np.ndarray) -> np.ndarray:
+    """Which fields (F, F) are parts of one vector: those of which one condition speaks, and the velocities of a flow,
+    of which the equation of a lower order does."""
+    full, out = np.array(rec.weights) == 0, joined | np.eye(rec.fields, dtype=bool)
+    for e, order in enumerate(rec.orders if any(rec.weights) else ()):
+        if order < max(rec.orders):
+            of = np.array([f for s, (f, _) in enumerate(rec.slots) if rec.pattern[e][s] and full[f]], int)
+            out[np.ix_(of, of)] = True
+    return np.linalg.matrix_power(out.astype(float), rec.fields) > 0
 
 
 def _given(rec: Recursion, groups: list[Group], length: float) -> tuple[np.ndarray, np.ndarray] | None:
@@ -95,29 +112,18 @@ def _magnitudes(values: Any) -> np.ndarray:
 
 
 def _terms(
-    rec: Recursion, traced: Traced, points: np.ndarray, params: Any, sizes: np.ndarray, length: float
+    rec: Recursion, traced: Traced, points: np.ndarray, params: Any, length: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What a field of size one adds to each equation (E, F), and the size of each source (E,): medians.
-
-    Fields change within ``length``, half of the domain's; what is nonlinear is taken about the sizes that are held.
-    """
-    slots = None
-    lengths = np.array([length ** -float(sum(b)) for _, b in rec.slots])
-    if not traced.linear:
-        about = np.array([sizes[f] for f, _ in rec.slots]) * lengths
-        slots = np.broadcast_to(about[:, None, None], (len(about), 1, len(points)))
-        jac = traced.coefficients(points, 0, params=params, slots=slots)[0]
-    else:
-        jac = traced.leading(points, params)[:, :, None]
-    jac = np.median(_magnitudes(jac)[:, :, 0], axis=-1) * lengths
-    source = np.median(_magnitudes(traced.residuals(points, params=params)), axis=-1)
+    """What a field of size one, that changes within a length, adds to each equation (E, F), and the size of each
+    source (E,): medians."""
+    jac = np.median(_magnitudes(traced.leading(points, params)), axis=-1)
     out = np.zeros((len(rec.levels), rec.fields))
-    for s, (f, _) in enumerate(rec.slots):
-        out[:, f] += jac[:, s]
-    return out, source
+    for s, (f, b) in enumerate(rec.slots):
+        out[:, f] += jac[:, s] * length ** -float(sum(b))
+    return out, np.median(_magnitudes(traced.residuals(points, params=params)), axis=-1)
 
 
-def _made(rec: Recursion, terms: np.ndarray, source: np.ndarray, held: np.ndarray, joined: np.ndarray) -> np.ndarray:
+def _made(rec: Recursion, terms: np.ndarray, source: np.ndarray, held: np.ndarray, vectors: np.ndarray) -> np.ndarray:
     """The sizes (F,) of fields, from what their equations make of the sources, of the values held and of one another.
 
     Fields that drive one another without end, as the two parts of a wave do, are made no larger by that.
@@ -141,12 +147,7 @@ def _made(rec: Recursion, terms: np.ndarray, source: np.ndarray, held: np.ndarra
     gain = np.zeros((rec.fields,) * 2)
     gain[fields] = terms[equations] / own[:, None]
     gain[:, np.array(rec.weights) != 0] = 0.0
-    # The velocities of a flow are one vector, and so is what one condition speaks of, as a traction.
-    joined = joined & np.isin(np.arange(rec.fields), free)
-    for e in np.setdiff1d(np.arange(len(terms)), equations):
-        together = free[terms[e, free] > 0]
-        joined[np.ix_(together, together)] = True
-    gain[joined] = np.maximum(gain[joined], 1.0)
+    gain[vectors] = np.maximum(gain[vectors], 1.0)
     np.fill_diagonal(gain, 0.0)
     gain /= max(1.0, float(np.abs(np.linalg.eigvals(gain)).max(initial=0.0)))
     if not sizes.any():
