@@ -247,15 +247,12 @@ def constraints(rec: Recursion, jac: Any, length: Any, xp: Any = jnp) -> tuple[A
     powers = _powers(rec, jac.shape[-1])
     scaled = jac * (length ** xp.arange(int(powers.max()) + 1))[powers]
     matrix = _scattered(rec, scaled, np) if xp is np else _gathered(rec, scaled)
-    sizes = np.array(rec.sizes or [1.0] * rec.fields)
-    if rec.sizes:
-        matrix = matrix * np.repeat(sizes, rec.size)
     units = field_units(rec, matrix, xp)
-    if any(rec.weights):
+    if rec.sizes or any(rec.weights):
         matrix = matrix * xp.repeat(units, rec.size)
     square = xp.sum(matrix**2, axis=1)
     norm = xp.sqrt(xp.where(square > 0, square, 1.0))  # an empty row has a derivative too
-    return matrix / norm[:, None], row_lifts(rec, length, xp) / norm, units * sizes if rec.sizes else units
+    return matrix / norm[:, None], row_lifts(rec, length, xp) / norm, units
 
 
 def field_units(rec: Recursion, matrix: Any, xp: Any = jnp) -> Any:
@@ -263,18 +260,22 @@ def field_units(rec: Recursion, matrix: Any, xp: Any = jnp) -> Any:
 
     A pressure is in units of viscosity over length, or of momentum where that is more: a power of length alone
     leaves it so much too light, or too heavy, as the viscosity differs from one, and its modes between the particles
-    are held by nothing. Fields of weight zero keep their units.
+    are held by nothing. Fields of weight zero are taken in their sizes, where these differ by much.
     """
+    sizes = xp.asarray(rec.sizes or (1.0,) * rec.fields)
     if not any(rec.weights):
-        return xp.ones(rec.fields)
+        return sizes
     equations = np.array(rec.equation_rows)
     squares = xp.sum(matrix[equations].reshape(len(equations), rec.fields, rec.size) ** 2, axis=2)  # (E, F)
+    if rec.sizes:
+        squares = squares * sizes**2
     heavy = np.array(rec.weights) == 0
     others = xp.sum(xp.where(heavy, squares, 0.0), axis=1)
     shared = (squares > 0) & (others > 0)[:, None]
     own, rest = xp.sum(xp.where(shared, squares, 0.0), axis=0), xp.sum(xp.where(shared, others[:, None], 0.0), axis=0)
     known = (own > 0) & ~heavy
-    return xp.where(known, xp.sqrt(xp.where(known, rest, 1.0) / xp.where(known, own, 1.0)), 1.0)
+    units = xp.where(known, xp.sqrt(xp.where(known, rest, 1.0) / xp.where(known, own, 1.0)), 1.0)
+    return units * sizes if rec.sizes else units
 
 
 def source_rows(rec: Recursion, residual: Any) -> Any:
